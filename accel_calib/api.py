@@ -19,7 +19,7 @@ from .effects import model_with, own_effects, OwnEffect, simulate_poses, simulat
 from .errors import InputError
 from .geometry import rotation_from_rpy, spread_directions, unit
 from .logs import (
-    are_untimed_samples, Frame, LogOptions, read_poses as read_pose_table,
+    are_samples, Frame, LogOptions, read_poses as read_pose_table,
     read_recording as read_whole_recording)
 from .pipeline import calibrated, calibrated_log, captured_from, Flat, options_for, Plan, poses_of
 from .refinement import refine as find_effects, Refinement as Refinement
@@ -158,7 +158,8 @@ def capture(recording: Source | Recording | Data, *, units: UnitName | None = No
         out of range.
 
     """
-    if not isinstance(recording, Recording) and not _is_log(recording):
+    if not isinstance(recording, str | PathLike | Recording) and (
+            isinstance(recording, Table) or not hasattr(recording, 'columns')):
         raise InputError(f'found {type(recording).__name__}, expected a recording',
                          'pass a path, a Recording, or a DataFrame with times')
     found, _ = captured_from(*_asked(recording, units, gravity, {
@@ -436,11 +437,14 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
         out of range, or makes readings beyond any sensor.
 
     """
-    _check_within(poses=(poses, 1, _MOST_ROWS), samples=(samples, 1, _MOST_ROWS),
-                  noise=(noise, 0, LARGEST), seed=(seed, 0, math.inf))
-    if recording:
-        count = poses * (dwell + turn) * rate
-        _check_within(**{'poses * (dwell + turn) * rate': (count, 0, _MOST_ROWS)})
+    rows = min(poses, _MOST_ROWS) * (dwell + turn) * rate if recording else 0
+    for name, value, least, most in (
+            ('poses', poses, 1, _MOST_ROWS), ('samples', samples, 1, _MOST_ROWS),
+            ('noise', noise, 0, LARGEST), ('seed', seed, 0, math.inf),
+            ('poses * (dwell + turn) * rate', rows, 0, _MOST_ROWS)):
+        if not least <= value <= most:
+            raise InputError(f'{name} is {str(value)[:40]}, expected {least:g} to '
+                             f'{most:g}', f'correct {name}')
     known = units_of(units, gravity)
     # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
     rotation = rotation_from_rpy(*np.radians(np.asarray(mounting, float))).T
@@ -477,20 +481,6 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
     return replace(kept, units=units)  # type: ignore[return-value]
 
 
-def _check_within(**numbers: tuple[float, float, float]) -> None:
-    """Check numbers by their names, each with its least and its largest value."""
-    for name, (value, least, most) in numbers.items():
-        if not least <= value <= most:
-            raise InputError(f'{name} is {str(value)[:40]}, expected {least:g} to '
-                             f'{most:g}', f'correct {name}')
-
-
-def _is_log(given: object) -> bool:
-    """Return whether this is a path or a DataFrame, and no table or array."""
-    return isinstance(given, str | PathLike) or (
-        hasattr(given, 'columns') and not isinstance(given, Table))
-
-
 def _asked(given: Source | Poses | Recording | Data, units: UnitName | None,
            gravity: float = STANDARD_GRAVITY, settings: Mapping[str, Any] = {}
            ) -> tuple[Any, LogOptions, dict[str, Any]]:
@@ -499,8 +489,10 @@ def _asked(given: Source | Poses | Recording | Data, units: UnitName | None,
     options = LogOptions(units=units or '', gravity=gravity,
                          **{name: settings[name] for name in of_log})
     source: Any = given
-    if _is_log(given):
-        source = Path(given) if isinstance(given, str | PathLike) else Frame(given)
+    if isinstance(given, str | PathLike):
+        source = Path(given)
+    elif hasattr(given, 'columns') and not isinstance(given, Table):
+        source = Frame(given)
     elif not isinstance(given, Table):
         columns = {'reading': np.asarray(given, float)}
         shape = columns['reading'].shape
@@ -508,7 +500,7 @@ def _asked(given: Source | Poses | Recording | Data, units: UnitName | None,
             raise InputError(f'the array has shape {shape}, expected (n, 3) readings',
                              'pass such an array, a table or a DataFrame')
         check_values(columns, 'the array')
-        if are_untimed_samples(columns):
+        if are_samples(columns):
             raise InputError(f'the {shape[0]} rows of the array look like samples of a recording, '
                              'expected one row for each pose', 'pass a Recording, or a DataFrame '
                              'with a column time')

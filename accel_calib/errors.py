@@ -93,19 +93,15 @@ def is_full(error: OSError) -> bool:
     return error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
-def system_error(error: OSError) -> InputError:
-    """Return an error of the system, with the name of its file and what to do."""
-    name = f'{error.filename}: ' if error.filename else ''
-    return InputError(f'{name}{error.strerror or error}', FREE_SPACE if is_full(error) else
-                      'check the name and the permissions')
-
-
 def known_error(error: Exception) -> AccelCalibError:
     """Return any error as one for users; of a defect of this program, the traceback is stored."""
     if isinstance(error, AccelCalibError):
         return error
-    return system_error(error) if isinstance(error, OSError) else InputError(
-        crash_words(error), 'report it, with the input')
+    if not isinstance(error, OSError):
+        return InputError(crash_words(error), 'report it, with the input')
+    name = f'{error.filename}: ' if error.filename else ''
+    return InputError(f'{name}{error.strerror or error}', FREE_SPACE if is_full(error) else
+                      'check the name and the permissions')
 
 
 FREE_SPACE = 'free space on the disk'

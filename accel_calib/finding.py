@@ -218,16 +218,10 @@ def explained_by(findings: Iterable[Finding]) -> Iterator[None]:
     try:
         yield
     except RefusedFitError as err:
-        for each in findings:
-            if each.next.kind != 'record':
-                continue
-            raise RefusedFitError(f'{err.message}; {each.text}', each.advice) from None
-        raise
-
-
-def ranked(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return findings of the worst level first, and within a level in the order of `KINDS`."""
-    return tuple(sorted(findings, key=lambda each: (-LEVELS.index(each.level), _RANKS[each.kind])))
+        found = next((each for each in findings if each.next.kind == 'record'), None)
+        if found is None:
+            raise
+        raise RefusedFitError(f'{err.message}; {found.text}', found.advice) from None
 
 
 @dataclass(frozen=True)
@@ -270,7 +264,8 @@ class Rating:
 
 def rated(findings: Iterable[Finding], good: str, figures: str, after: NextStep) -> Rating:
     """Return the rating with the most informative of the worst findings; `after` a good one."""
-    ranks = ranked(findings)
+    ranks = tuple(sorted(findings, key=lambda each: (-LEVELS.index(each.level),
+                                                     _RANKS[each.kind])))
     below = [each for each in ranks if each.level != 'GOOD']
     if not below:
         return Rating('GOOD', good, figures, after, ranks)

@@ -29,7 +29,7 @@ from .calibration import (
 from .effects import Context, LADDER, Model, OwnEffect, PROCESSES
 from .errors import InputError, RefusedFitError, saying
 from .finding import explained_by, Finding
-from .findings import outside_line, rate, Rating
+from .findings import outside_words, rate, Rating, USES_LIMIT
 from .geometry import unit
 from .logs import Frame, LogOptions, open_log, OpenLog, Piped, Progress
 from .stillness import (
@@ -309,8 +309,8 @@ class Outcome:
     """
 
     calibration: Calibration
-    refinement: Refinement | None = field(repr=False)
-    line: str
+    refinement: Refinement | None = field(default=None, repr=False)
+    line: str = ''
 
     @cached_property
     def rating(self) -> Rating:
@@ -394,22 +394,16 @@ def is_partial(calibration: Calibration) -> bool:
 
 
 @dataclass(frozen=True)
-class ThermalOutcome:
+class ThermalOutcome(Outcome):
     """A calibration with the offset over temperature, its curve, and the logs."""
 
-    calibration: Calibration
-    curve: Curve
-    logs: Sequence[Intake]
-    read_as: str
-
-    @cached_property
-    def rating(self) -> Rating:
-        """Return whether the calibration is good, and the next step."""
-        return rate(self.calibration)
+    curve: Curve = field(kw_only=True)
+    logs: Sequence[Intake] = field(kw_only=True)
+    read_as: str = field(kw_only=True)
 
 
 def calibrated_log(source: Source, options: LogOptions, found: Intake, plan: Plan = Plan()
-                   ) -> Outcome | ThermalOutcome:
+                   ) -> Outcome:
     """
     Calibrate the poses that `poses_of` found in a log, or its ramp if it is of a still board.
 
@@ -448,7 +442,23 @@ def thermally_calibrated(logs: Sequence[Intake], plan: Plan = Plan()) -> Thermal
     read_as = ', '.join(dict.fromkeys(each.read_as for each in logs if each.read_as))
     with saying(read_as):
         turned = [each for each in logs if not isinstance(each, RampIntake)]
-        _check_logs(logs, len(turned))
+        if len(turned) == len(logs):
+            raise InputError(f'{counted(len(turned), "log")} of poses in many directions, '
+                             'expected one of a still board whose temperature changes', 'record '
+                             'the board while it warms up from the freezer, and give this log, '
+                             'too')
+        if len(turned) > 1:
+            raise InputError(f'{len(turned)} logs are of poses in many directions, expected at '
+                             'most one', 'leave out the others')
+        tables = [each.poses for each in logs]
+        # A sensor is known by its device id in an autopilot, or else by its name.
+        devices = {each.autopilot.device_id for each in tables if each.autopilot} - {None}
+        names = {each.sensor for each in tables if not each.autopilot} - {''}
+        for known in (devices, names):
+            if len(known) > 1:
+                several = ', '.join(sorted(map(str, known)))
+                raise InputError(f'the logs are of the sensors {several}, expected one sensor',
+                                 'choose one with --sensor, or give the logs of one sensor')
         curve = curve_of([each.ramp for each in logs if isinstance(each, RampIntake)])
         if turned:
             rows, units = turned[0].poses, turned[0].units
@@ -460,27 +470,7 @@ def thermally_calibrated(logs: Sequence[Intake], plan: Plan = Plan()) -> Thermal
             rows = made.poses
         levelled = level_by_rows(made, made.poses, plan.frame, _row(rows, plan.flat),
                                  plan.nose_down)
-        return ThermalOutcome(levelled, curve, logs, read_as)
-
-
-def _check_logs(logs: Sequence[Intake], turned: int) -> None:
-    """Refuse logs without a ramp, with several logs of poses (`turned`), or of several sensors."""
-    if turned == len(logs):
-        raise InputError(f'{counted(turned, "log")} of poses in many directions, expected '
-                         'one of a still board whose temperature changes', 'record the board '
-                         'while it warms up from the freezer, and give this log, too')
-    if turned > 1:
-        raise InputError(f'{turned} logs are of poses in many directions, expected at most '
-                         'one', 'leave out the others')
-    tables = [each.poses for each in logs]
-    # A sensor is known by its device id in an autopilot, or else by its name.
-    devices = {each.autopilot.device_id for each in tables if each.autopilot} - {None}
-    names = {each.sensor for each in tables if not each.autopilot} - {''}
-    for known in (devices, names):
-        if len(known) > 1:
-            raise InputError(f'the logs are of the sensors {", ".join(sorted(map(str, known)))}, '
-                             'expected one sensor', 'choose one with --sensor, or give the logs '
-                             'of one sensor')
+        return ThermalOutcome(levelled, curve=curve, logs=logs, read_as=read_as)
 
 
 def _row(poses: Poses, flat: Flat) -> int | None:
@@ -566,5 +556,6 @@ class Correction:
     @property
     def notes(self) -> list[str]:
         """Return what the samples lack, and what left the range of the calibration, so far."""
-        return [*filter(None, [self._context.lacking]),
-                *map(outside_line, self._context.left)]
+        return [*filter(None, [self._context.lacking]), *(
+            f'{each.count} of {counted(each.samples, "sample")} are outside of the range of the '
+            f'calibration: {outside_words(each)}; {USES_LIMIT}' for each in self._context.left)]

@@ -68,6 +68,8 @@ COLUMNS: dict[str, Column] = {
                         'true specific force (known orientation); in g for native units'),
     'previous': Column(('from_x', 'from_y', 'from_z'), '', 'unit vector towards the previous '
                        'pose; computed from the order of the poses'),
+    'earlier': Column(('earlier_x', 'earlier_y', 'earlier_z'), '', 'unit vector towards the '
+                      'previous pose, at the turn before the last one', made=True),
     'duration': Column(('duration',), 's', 'time from the first to the last sample of a pose'),
     'since_turn': Column(('since_turn',), 's', 'time from the last turn to the start of a pose; '
                          'computed from the times'),
@@ -130,19 +132,13 @@ class Record:
     """
 
     def __eq__(self, other: object) -> bool:
-        related = isinstance(other, type(self)) or isinstance(self, type(other))
-        return related and _same_fields(self, other)
+        return _same(self, other)
 
     __hash__ = None  # type: ignore[assignment]
 
     def __getstate__(self) -> dict[str, Any]:
         """Return a copy of all values, to which another thread may be adding cached properties."""
         return vars(self).copy()
-
-
-def _same_fields(one: Any, other: Any) -> bool:
-    return all(_same(getattr(one, each.name), getattr(other, each.name))
-               for each in fields(one) if each.compare)
 
 
 def _same(one: Any, other: Any) -> bool:
@@ -153,8 +149,11 @@ def _same(one: Any, other: Any) -> bool:
         return one.keys() == other.keys() and all(_same(one[key], other[key]) for key in one)
     if isinstance(one, tuple):
         return len(one) == len(other) and all(map(_same, one, other))
-    if is_dataclass(one) and not isinstance(one, Record):
-        return type(one) is type(other) and _same_fields(one, other)
+    related = type(one) is type(other) or (isinstance(one, Record) and (
+        isinstance(other, type(one)) or isinstance(one, type(other))))
+    if is_dataclass(one):
+        return related and all(_same(getattr(one, each.name), getattr(other, each.name))
+                               for each in fields(one) if each.compare)
     return bool(one == other or (one != one and other != other))
 
 
@@ -201,7 +200,7 @@ class Autopilot:
 
 def name_from(text: str, what: str) -> str:
     """Return a name or a text from outside as one line; InputError if it is too long."""
-    name = one_line(text).strip()
+    name = text and one_line(text).strip()
     if len(name) > LONGEST_NAME:
         raise InputError(f'{what} has {len(name)} characters, expected at most {LONGEST_NAME}',
                          'shorten it')
@@ -343,10 +342,6 @@ class Poses(Table):
         noise: Floats = self['std'] / np.sqrt(self['count'])[:, np.newaxis]
         return np.hypot(noise, self['own_scatter']) if 'own_scatter' in self else noise
 
-    def as_recording(self) -> Recording:
-        """Return the rows as samples; they have times."""
-        return Recording(**vars(self))
-
 
 class Recording(Table):
     """Samples in the order of time, one row per sample."""
@@ -443,13 +438,14 @@ def check_units(poses: Table, units: Units, source: str = '') -> None:
     """
     if len(poses) == 0:
         return
+    least, most = _LIKELY_G
     length = median_length(poses.reading)
-    if not units.is_native and not _is_likely(length, units.per_g):
-        supported = next((name for name in _likely(length) if name in _SUPPORTED), None)
+    if not units.is_native and not least <= length / units.per_g <= most:
+        names, look = _likely_units(length)
+        supported = next((name for name in names if name in _SUPPORTED), None)
         advice = (f'set the units of the readings to {supported} (--units {supported})'
                   if supported else
-                  f'{_look(length)}set the units of the readings to native; the fit estimates '
-                  'their scale')
+                  f'{look}set the units of the readings to native; the fit estimates their scale')
         raise InputError(f'{source and f"{source}: "}the length of the readings is about '
                          f'{length:.4g}, expected about {units.per_g:.4g} at rest in '
                          f'{units.name}', advice)
@@ -458,10 +454,11 @@ def check_units(poses: Table, units: Units, source: str = '') -> None:
                         if units.is_native else
                         (units.per_g, f'in {units.name}, the unit of the readings'))
         length = median_length(poses['reference'])
-        if not _is_likely(length, per_g):
+        if not least <= length / per_g <= most:
+            _, look = _likely_units(length)
             raise InputError(f'the length of the known forces ref_x,ref_y,ref_z is about '
                              f'{length:.4g}, expected about {per_g:.4g} {words}',
-                             f'{_look(length)}multiply them by {per_g / max(length, 1e-12):.4g}'
+                             f'{look}multiply them by {per_g / max(length, 1e-12):.4g}'
                              if length > 0.0 else 'fill the columns, or remove them')
 
 
@@ -471,19 +468,11 @@ def median_length(vectors: Floats) -> float:
         return float(np.median(np.linalg.norm(vectors, axis=1)))
 
 
-def _is_likely(length: float, per_g: float) -> bool:
-    return _LIKELY_G[0] <= length / per_g <= _LIKELY_G[1]
-
-
-def _look(length: float) -> str:
-    likely = _likely(length)
-    return f'they look like {" or ".join(likely)}: ' if likely else ''
-
-
-def _likely(length: float) -> list[str]:
-    """Return the units in which this length is about 1 g, or else the nearest unit."""
+def _likely_units(length: float) -> tuple[list[str], str]:
+    """Return the units in which this length is about 1 g, or else the nearest, and in words."""
     fits = {name: max(length / per_g, per_g / max(length, 1e-300))
             for name, per_g in _OTHERS.items()}
     well = [name for name, factor in fits.items() if factor <= _ABOUT]
     nearest = min(fits, key=lambda name: fits[name])
-    return well or ([nearest] if fits[nearest] <= _LIKELY_G[1] else [])
+    names = well or ([nearest] if fits[nearest] <= _LIKELY_G[1] else [])
+    return names, f'they look like {" or ".join(names)}: ' if names else ''

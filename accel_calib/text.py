@@ -55,19 +55,6 @@ def milli(value: float, *, signed: bool) -> str:
     return with_minus(f'{round(value, decimals) + 0.0:{"+" if signed else ""}.{decimals}f}')
 
 
-def percentage(share: float) -> str:
-    """Return a share as a whole number of percent."""
-    return f'{share:.0%}'.replace('%', ' %')
-
-
-def power_of_ten(value: float, sd: float) -> str:
-    """Return ``value ± sd`` of a positive value, with a power of ten if it is large or small."""
-    power = math.floor(math.log10(value))
-    if -3 <= power <= 3:
-        return with_sd(value, sd)
-    return f'({with_sd(value / 10.0 ** power, sd / 10.0 ** power)})e{power}'
-
-
 def with_minus(text: str) -> str:
     """Return text with the minus sign of typography."""
     return text.replace('-', '−')

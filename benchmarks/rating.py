@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 from accel_calib.calibration import Calibration, fit_poses
 from accel_calib.errors import AccelCalibError
-from accel_calib.findings import Expected, GOOD_MG, rate, rate_refinement, Rating
+from accel_calib.findings import Expected, GOOD_MG, rate, Rating
 from accel_calib.geometry import unit
 from accel_calib.refinement import refine
 from accel_calib.table import Floats, numbered, Poses
@@ -166,7 +166,8 @@ def rate_set(index: int, number: int, seed: int) -> Result:
         rated: Rating = rate(calibration)
         if kind.refined:
             found = refine(poses, units)
-            calibration, rated = found.calibration, rate_refinement(found)
+            calibration = found.calibration
+            rated = rate(calibration, refinement=found)
     except AccelCalibError:
         return Result(kind, 'refused')
     force, at = random_directions(NEW, rng), rng.choice(temperature, NEW)

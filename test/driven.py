@@ -10,7 +10,7 @@ from typing import Any
 
 from accel_calib.errors import AccelCalibError
 from accel_calib.session import (
-    answered, CalibratorSettings, checks, columns_of, Log, next_step, Result, run, Session,
+    answered, CalibratorSettings, columns_of, diagnostics, Log, next_step, Result, run, Session,
     ShowPoses, state, Task)
 import numpy as np
 import pytest
@@ -80,7 +80,7 @@ class Driver:
 
     @property
     def poses(self) -> Any:
-        return self.session.sensor.live.book.poses()
+        return self.session.sensor.live.poses()
 
     def feed(self, readings: Any, frame_id: str = 'imu_link', **context: float) -> int:
         """Push readings [m/s²] with their context, and return the number of accepted messages."""
@@ -104,7 +104,7 @@ class Driver:
         return '\n'.join(line.words for line in self.log if line.severity == severity)
 
     def finding(self, name: str) -> Any:
-        return next(each for each in checks(self.session.state) if each.concern == name)
+        return next(each for each in diagnostics(self.session.state) if each.concern == name)
 
 
 class Person:

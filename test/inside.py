@@ -80,8 +80,7 @@ from accel_calib.refinement.search import (
     _is_better as is_better_than_walk, _less as less, search as search_effects)
 from accel_calib.refinement.state import beginning, candidates, fitted_state, linearised, WORTH
 from accel_calib.refinement.steps import remarks_on
-from accel_calib.report.page import axis_figures
-from accel_calib.report.refinement import all_drawings, curve_parts
+from accel_calib.report.page import all_drawings, axis_figures, curve_parts
 from accel_calib.report.residuals import residuals_of
 from accel_calib.report.sheet import page as page_of
 from accel_calib.report.stability import comparison_page
@@ -90,14 +89,13 @@ from accel_calib.session import store as session_store, worker
 from accel_calib.session.commands import poses_changed
 from accel_calib.session.conditions import step_of
 from accel_calib.session.fitting import fit as fit_in_node
-from accel_calib.session.live_capture import LiveCapture, PoseBook, with_temperature
+from accel_calib.session.live_capture import LiveCapture, with_temperature
 from accel_calib.session.pose_guide import Guide
 from accel_calib.session.sensor import new_sensor, rest_after
 from accel_calib.session.settings import capture_settings, changed, default_of
 from accel_calib.session.state import figures
 from accel_calib.session.store import (
-    aside, Identity, lock as lock_files, MOST_STEPS, Store as SensorStore, store_of,
-    writing_advice)
+    aside, MOST_STEPS, SensorFiles, Store as SensorStore, store_of, writing_advice)
 from accel_calib.session.stream import StreamStatistics, TemperatureHistory
 from accel_calib.session.use import adopt as use_calibration
 from accel_calib.session.worker import Worker, WorkerProcess
@@ -185,12 +183,11 @@ PATIENCE_WITH_A_CHILD = child, '_PATIENCE_S'
 
 if find_spec('aiohttp'):  # what the live page needs is not installed everywhere
     from accel_calib.live import server, viewer
-    from accel_calib.live.exchange import log_line as live_log
     from accel_calib.live.host import Host
     from accel_calib.live.server import PageServer
     from accel_calib.live.viewer import (
-        announce, COMMANDS as LIVE_COMMANDS, LARGEST as LARGEST_LIVE_MESSAGE,
-        PERIOD as LIVE_PERIOD, qr_code, reachable)
+        announce, BUTTONS, LARGEST as LARGEST_LIVE_MESSAGE, PERIOD as LIVE_PERIOD, qr_code,
+        reachable)
 
     PATIENCE_FOR_A_HELLO = viewer, '_HELLO_S'
     PATIENCE_FOR_A_REQUEST = server, '_REQUEST_S'

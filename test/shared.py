@@ -119,7 +119,7 @@ def with_effects(calibration: Calibration, values: Mapping[Any, Any], variance: 
 
 
 SHAPES = {'start': 1000.0, 'tau': 900.0, 'instant': 4000.0, 'lag': 200.0, 'of_sensor': 0.0,
-          'form': 1.0, 'low': 10.0, 'high': 3000.0}
+          'form': 1.0, 'memory': 0.5, 'low': 10.0, 'high': 3000.0}
 """Values of the shapes of effects, in the context of `context_of`."""
 
 
@@ -135,7 +135,8 @@ def context_of(rng: np.random.Generator, count: int) -> dict[str, Floats]:
     return {'temperature': rng.uniform(-20, 60, count), 'std': rng.uniform(0, 0.2, (count, 3)),
             'time': 1000.0 + np.sort(rng.uniform(0, 7200, count)),
             'supply_voltage': rng.uniform(3, 3.6, count), 'rate': rng.normal(size=(count, 3)),
-            'previous': random_directions(count, rng), 'since_turn': rng.uniform(0, 900, count),
+            'previous': random_directions(count, rng),
+            'earlier': random_directions(count, rng), 'since_turn': rng.uniform(0, 900, count),
             'temperature_rate': rng.uniform(-0.1, 0.1, count)}
 
 

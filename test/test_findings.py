@@ -9,9 +9,9 @@ import shlex
 
 import accel_calib as ac
 from accel_calib.calibration import fit_partial, fit_poses, level, mounting_only, Rejected
-from accel_calib.finding import Finding, KINDS, NextStep, ranked, without
+from accel_calib.finding import Finding, KINDS, NextStep, rated, without
 from accel_calib.findings import (
-    Expected, figures_of, GOOD_MG, rate, rate_comparison, rate_refinement, rate_verification)
+    Expected, figures_of, GOOD_MG, rate, rate_comparison, rate_verification)
 from accel_calib.logs import write_table
 from accel_calib.refinement import refine
 from inside import (
@@ -99,7 +99,8 @@ def test_findings_are_ranked_by_level_and_then_by_kind():
     first, other, *_, last = KINDS
     note, usable = Finding(first, 'a'), Finding(last, 'b', level='USABLE')
     better, bad = Finding(other, 'c', level='USABLE'), Finding(last, 'd', level='BAD')
-    assert ranked([note, usable, better, bad]) == (bad, better, usable, note)
+    ranks = rated([note, usable, better, bad], '', '', NextStep('done', '')).findings
+    assert ranks == (bad, better, usable, note)
     assert without([note, bad], first) == (bad,)
 
 
@@ -172,7 +173,7 @@ def test_a_hidden_effect_makes_a_fit_usable_and_its_refinement_good(effects, con
     assert (rating.name, rating.next.kind) == ('USABLE', 'refine')
     result = ac.refine(table)
     assert [step.effect for step in result.steps] == list(effects)
-    assert rate_refinement(result).name == 'GOOD'
+    assert rate(result.calibration, refinement=result).name == 'GOOD'
     base = rate(ac.fit(table), refinement=result)
     assert (base.name, base.next.kind) == ('USABLE', 'refine')
     assert next(iter(effects)) in base.reason
@@ -194,7 +195,7 @@ def test_a_fit_beside_a_refused_refinement_is_not_bad():
     rating = rate(ac.fit(table), refinement=refused)
     assert rating.name == 'USABLE'
     assert rating.next == NextStep('poses', 'take more poses')
-    assert rate_refinement(refused).name == 'BAD'
+    assert rate(refused.calibration, refinement=refused).name == 'BAD'
 
 
 def test_many_knocked_poses_are_usable_and_one_of_many_is_good():

@@ -97,8 +97,9 @@ def test_each_recording_becomes_a_row_and_a_calibration_on_the_workers(
         calibrate: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_fleet(tmp_path / 'in', 6, 2)
     (tmp_path / 'in' / 'bad.csv').write_text('nothing of use\n')
-    for name in ('merge', 'of_sensor'):
-        monkeypatch.setattr(Store, name, None)  # in this process, which must not need them
+    for where, name in (
+            (Store, 'merge'), (sys.modules['accel_calib.fleet.overview'], 'read_parquet')):
+        monkeypatch.setattr(where, name, None)  # in this process, which must not need them
     summary = calibrate()
     assert summary.counts == {'ok': 12, 'error': 1}
     assert summary.priors[''].sensors == 6

@@ -12,8 +12,8 @@ from accel_calib.session import CalibratorSettings
 from accel_calib.stillness import capture, CaptureSettings, Dwell, poses_from
 from accel_calib.stored import read_calibration
 from inside import (
-    LiveCapture, model_with, new_sensor, PoseBook, rest_after, simulate_recording,
-    spread_directions, with_temperature)
+    LiveCapture, model_with, new_sensor, rest_after, simulate_recording, spread_directions,
+    with_temperature)
 import numpy as np
 import pytest
 from shared import GRAVITY, MPS2, NATIVE, Readings, rows_of, samples_of, Stored
@@ -52,7 +52,7 @@ def test_the_first_poses_at_a_limit_are_marked_as_in_a_recording(seed: int) -> N
     live = LiveCapture(CaptureSettings(), MPS2)
     push_all(live, reading)
     whole = capture(samples_of(np.arange(len(reading)) / 50.0, reading), MPS2).poses
-    poses = live.poses(())
+    poses = live.poses_for_fit(())
     assert poses['at_limit'].tolist() == whole['at_limit'][:len(poses)].tolist()
     assert poses['at_limit'].tolist() == [1.0, 1.0, 1.0, *[0.0] * (len(poses) - 3)]
 
@@ -71,24 +71,24 @@ def test_a_board_that_sends_counts_is_still_within_3_s(up: Any, noise: float, se
         list(live.push(block, True))
         still.append((block[-1, 0], live.still))
     assert all(found for time, found in still if time > 3.0)
-    assert len(live.book.poses()) == 1
+    assert len(live.poses()) == 1
 
 
 def test_rest_counts_before_it_ends_and_its_final_average_replaces_it(readings: Readings) -> None:
     live = LiveCapture(CaptureSettings(), MPS2)
     changes = push_all(live, readings([[0, 0, 1]], dwell=9.0))
     counts = [change.rest.samples for change in changes if change.poses]
-    assert len(live.book.poses()) == 1
+    assert len(live.poses()) == 1
     assert counts == sorted(counts)
     assert counts[0] < 80
     assert counts[-1] > 150
     live = LiveCapture(CaptureSettings(repeated='keep'), MPS2)
     changes = push_all(live, readings(FACES, dwell=2.0))
-    assert len(live.book.poses()) == 3
+    assert len(live.poses()) == 3
     assert sum(len(change.ended) for change in changes) >= 1
     starts = [change.rest.start for change in changes if change.rest]
     assert starts == sorted(starts)  # an end that is known late is not that of the last rest
-    assert np.all(np.diff(live.book.poses()['time']) > 1.5)
+    assert np.all(np.diff(live.poses()['time']) > 1.5)
 
 
 @pytest.mark.parametrize(('rate', 'turn', 'dwell'), [
@@ -100,9 +100,9 @@ def test_no_pose_of_a_turned_sensor_is_doubtful(dwell: float, turn: float, rate:
         model_with({}), np.array(FACES, float), np.random.default_rng(1), noise_g=0.002,
         rate_hz=rate, dwell=dwell, turn=turn)
     changes = push_all(live, recording.reading * GRAVITY, rate=rate, omega=recording['rate'])
-    assert len(live.book.poses()) == 3
+    assert len(live.poses()) == 3
     assert sum(change.doubted for change in changes) == 0
-    assert 'doubtful' not in live.book.poses()
+    assert 'doubtful' not in live.poses()
 
 
 def test_removed_pose_is_not_captured_again_in_the_same_rest(readings: Readings) -> None:
@@ -111,7 +111,7 @@ def test_removed_pose_is_not_captured_again_in_the_same_rest(readings: Readings)
     assert live.undo()
     push_all(live, rest[150:], start=3.0)
     push_all(live, readings(FACES[1:], dwell=2.0), start=12.0)
-    assert len(live.book.poses()) == 2
+    assert len(live.poses()) == 2
 
 
 def test_without_auto_capture_only_requested_poses_are_captured(readings: Readings) -> None:
@@ -122,41 +122,41 @@ def test_without_auto_capture_only_requested_poses_are_captured(readings: Readin
     assert rest is not None
     live.capture(rest)
     push_all(live, turned[90:], start=1.8, capture=False)
-    poses = live.book.poses()
+    poses = live.poses()
     assert len(poses) == 1
     assert poses['reading'][0, 2] > 9.0
 
 
-def book_of(rests: Iterable[Any], repeated: Any = 'merge') -> PoseBook:
+def book_of(rests: Iterable[Any], repeated: Any = 'merge') -> LiveCapture:
     """Return the poses of rests, each with its time, direction and perhaps temperature."""
-    book = PoseBook(CaptureSettings(repeated=repeated), MPS2)
+    live = LiveCapture(CaptureSettings(repeated=repeated), MPS2)
     for time, direction, *warm in rests:
-        book.put(replace(dwell(time, direction), context=dict(zip(['temperature'], warm))),
+        live.put(replace(dwell(time, direction), context=dict(zip(['temperature'], warm))),
                  ended=True)
-    return book
+    return live
 
 
 def test_repeated_poses_are_merged_and_undone_one_by_one() -> None:
-    book = book_of([(0.0, [0, 0, 1]), (10.0, [1, 0, 0]), (20.0, [0.01, 0, 1])])
-    assert len(book.poses()) == 2
-    assert book.poses()['count'].max() == pytest.approx(100.0)
-    assert book.undo()
-    assert book.poses()['count'].max() == pytest.approx(50.0)
-    assert len(book.poses()) == 2
+    live = book_of([(0.0, [0, 0, 1]), (10.0, [1, 0, 0]), (20.0, [0.01, 0, 1])])
+    assert len(live.poses()) == 2
+    assert live.poses()['count'].max() == pytest.approx(100.0)
+    assert live.undo()
+    assert live.poses()['count'].max() == pytest.approx(50.0)
+    assert len(live.poses()) == 2
 
 
 def test_poses_of_a_robot_that_parks_for_years_need_bounded_memory() -> None:
     directions = spread_directions(6)
-    book = book_of((10.0 * k, directions[k % 6]) for k in range(600))
-    assert len(book.poses()) == 6
-    assert book.poses()['count'].sum() == pytest.approx(600 * 50.0)
-    assert len(book._earlier) + len(book._dwells) < 80
+    live = book_of((10.0 * k, directions[k % 6]) for k in range(600))
+    assert len(live.poses()) == 6
+    assert live.poses()['count'].sum() == pytest.approx(600 * 50.0)
+    assert len(live._earlier) + len(live._dwells) < 80
 
 
 def test_stored_poses_are_added_as_they_were() -> None:
-    book = book_of((10.0 * k, up) for k, up in enumerate(spread_directions(8)))
-    book.put(replace(dwell(-5.0, [0, 0, 1]), at_limit=True, doubtful=True), ended=True)
-    poses, again = book.poses(), book_of([])
+    live = book_of((10.0 * k, up) for k, up in enumerate(spread_directions(8)))
+    live.put(replace(dwell(-5.0, [0, 0, 1]), at_limit=True, doubtful=True), ended=True)
+    poses, again = live.poses(), book_of([])
     again.add_stored(poses)
     for key in poses.columns:
         np.testing.assert_allclose(again.poses()[key], poses[key], err_msg=key)
@@ -172,13 +172,13 @@ def test_change_is_reported_during_the_third_rest_and_survives_a_new_level(store
 
     for time, off in ((0.0, 0.0), (10.0, 0.05), (20.0, 0.0), (30.0, 0.005), (40.0, 0.005)):
         sensor = sensor.update(rest(time, off), 0.001)
-        sensor = sensor.end(rest(time, off), 0.001)
+        sensor = sensor.update(rest(time, off), 0.001, ended=True)
         assert sensor.drift.change is None
     sensor = sensor.update(rest(50.0, 0.005), 0.001)
     assert sensor.drift.change is not None
     sensor = sensor.update(rest(50.0, 0.0), 0.001)
     assert sensor.drift.change is not None  # what is reported stays for rests without it
-    sensor = sensor.end(rest(50.0, 0.005), 0.001)
+    sensor = sensor.update(rest(50.0, 0.005), 0.001, ended=True)
     assert sensor.drift.change is not None
     assert sensor.drift.count == 6
     flat = calibration.predict(np.array([[0.0, 0.6, 0.8]]) * GRAVITY)[0]
@@ -193,9 +193,9 @@ def test_rest_that_is_reported_late_does_not_hide_the_ongoing_rest(stored: Store
     early, late = dwell(0.0, [0, 0, 1]), dwell(10.0, [0, 0, 1.01])
     sensor = sensor.update(early, 0.001)
     sensor = sensor.update(late, 0.001)
-    sensor = sensor.end(early, 0.001)
+    sensor = sensor.update(early, 0.001, ended=True)
     assert sensor.drift.count == 2
-    sensor = sensor.end(late, 0.001)
+    sensor = sensor.update(late, 0.001, ended=True)
     assert sensor.drift.count == 2
     sensor = sensor.update(replace(late, end=late.end + 1e3), 0.001)  # by a clock that has jumped
     assert sensor.drift.count == 2
@@ -239,18 +239,18 @@ def test_robot_that_stands_for_hours_is_monitored_all_the_time(stored: Stored) -
 
 
 def test_pose_before_the_first_temperature_gets_that_of_the_next_pose() -> None:
-    book = book_of([(0.0, [0, 0, 1]), (10.0, [1, 0, 0], 31.0), (20.0, [0, 0, 1], 32.0)])
-    np.testing.assert_allclose(book.poses()['temperature'], [31.5, 31.0])
+    live = book_of([(0.0, [0, 0, 1]), (10.0, [1, 0, 0], 31.0), (20.0, [0, 0, 1], 32.0)])
+    np.testing.assert_allclose(live.poses()['temperature'], [31.5, 31.0])
     early = dwell(-500.0, [0, 1, 0])
-    assert 'temperature' not in poses_from(with_temperature([early, *book._dwells]))
+    assert 'temperature' not in poses_from(with_temperature([early, *live._dwells]))
 
 
 @pytest.mark.parametrize(('repeated', 'count'), [('merge', 100.0), ('refuse', 50.0)])
 def test_pose_at_another_temperature_is_not_repeated(repeated: Any, count: float) -> None:
-    book = book_of([(0.0, [0, 0, 1], 24.0), (10.0, [0, 0, 1], 25.0), (20.0, [0, 0, 1], 38.0)],
+    live = book_of([(0.0, [0, 0, 1], 24.0), (10.0, [0, 0, 1], 25.0), (20.0, [0, 0, 1], 38.0)],
                    repeated)
-    np.testing.assert_allclose(book.poses()['count'], [count, 50.0])
-    assert book.poses()['temperature'][1] == 38.0
+    np.testing.assert_allclose(live.poses()['count'], [count, 50.0])
+    assert live.poses()['temperature'][1] == 38.0
 
 
 def test_poses_of_a_noisier_time_are_marked_and_kept() -> None:
@@ -264,7 +264,7 @@ def test_poses_of_a_noisier_time_are_marked_and_kept() -> None:
                               * (noise > 0.001) + noise * rng.normal(size=(150, 3)))
             changes += push_all(live, np.vstack([moving, held]), start=start)
             start += 4.0
-    poses = live.book.poses()
+    poses = live.poses()
     doubted = sum(change.doubted for change in changes)
     assert len(poses) == 24
     assert doubted == np.sum(poses['doubtful']) == 12

@@ -20,10 +20,9 @@ from accel_calib.errors import InputError
 from accel_calib.session import CalibratorSettings
 from accel_calib.table import Floats
 from inside import (
-    CALIBRATION_ALONE, Host, LARGEST_LIVE_MESSAGE, LIVE_COMMANDS, live_log, LIVE_PERIOD,
-    model_with, PAGE_FOLDER, PageServer, PATIENCE_FOR_A_HELLO, PATIENCE_FOR_A_REQUEST,
-    PERIOD_OF_A_COMPLAINT, qr_code, reachable, simulate_recording, Source, spread_directions,
-    STUCK)
+    BUTTONS, CALIBRATION_ALONE, Host, LARGEST_LIVE_MESSAGE, LIVE_PERIOD, model_with, PAGE_FOLDER,
+    PageServer, PATIENCE_FOR_A_HELLO, PATIENCE_FOR_A_REQUEST, PERIOD_OF_A_COMPLAINT, qr_code,
+    reachable, simulate_recording, Source, spread_directions, STUCK)
 import numpy as np
 import pytest
 from shared import children, GRAVITY, MPS2, rows_of, table, wait
@@ -227,7 +226,7 @@ def test_without_the_token_the_page_only_shows(shared: Bench, token: str, words:
     wait(lambda: viewer.of('progress'))
     assert not viewer.got[0]['may']
     assert words in viewer.got[0]['why']
-    for command in LIVE_COMMANDS:
+    for command in BUTTONS:
         answer = viewer.ask(command)
         assert (answer['success'], answer['words']) == (False, viewer.got[0]['why'])
     assert shared.host.server.token not in str(viewer.got)
@@ -367,7 +366,9 @@ def test_a_stuck_viewer_is_closed_and_the_others_go_on(
         stuck.sendall(bytes([0x81, 0x80 | len(hello), 0, 0, 0, 0]) + hello)  # masked with zeros
         wait(lambda: len(bench.host.server.viewers) == 2)
         for number in range(500):  # more than the buffers of a connection hold
-            bench.host.server.show(live_log(10 ** 15 + number, 'info', 'x' * 1000, 0.0))
+            bench.host.server.show({
+                'kind': 'log', 'number': 10 ** 15 + number, 'severity': 'info', 'time': 0.0,
+                'words': 'x' * 1000})
         wait(lambda: len(bench.host.server.viewers) == 1)
     count = len(other.of('progress'))
     wait(lambda: len(other.of('progress')) > count + 5)

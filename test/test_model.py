@@ -84,6 +84,7 @@ def test_effects_by_hand():
     context = {'temperature': np.array([35.0]), 'std': np.array([[0.1, 0.2, 0.3]]),
                'time': np.array([7300.0]), 'supply_voltage': np.array([3.63]),
                'rate': np.array([[0.0, 0.0, 2.0]]), 'previous': np.array([[0.6, 0.0, -0.8]]),
+               'earlier': np.array([[0.0, 0.8, 0.6]]),
                'since_turn': np.array([20.0]), 'duration': np.array([10.0]),
                'temperature_rate': np.array([0.01])}
     cases = {
@@ -123,8 +124,8 @@ def test_model_refuses_what_is_not_in_the_catalogue(values):
 
 @pytest.mark.parametrize(('text', 'values'), [
     ('offset_temperature=1', [1, 1, 1, 0, 0]), ('offset_temperature=1,2,3', [1, 2, 3, 0, 0]),
-    ('gain_temperature=1,2,3,60,1', [1, 2, 3, 60, 1]), ('hysteresis=1,2,3', [1, 2, 3, 0]),
-    ('hysteresis=1,2,3,1', [1, 2, 3, 1])])
+    ('gain_temperature=1,2,3,60,1', [1, 2, 3, 60, 1]), ('hysteresis=1,2,3', [1, 2, 3, 0, 0]),
+    ('hysteresis=1,2,3,1', [1, 2, 3, 1, 0]), ('hysteresis=1,2,3,1,0.5', [1, 2, 3, 1, 0.5])])
 def test_shape_that_is_not_stated_has_its_usual_value(text, values):
     name, found = parse_effect(text)
     np.testing.assert_array_equal(found, values)

@@ -154,8 +154,9 @@ def guide_at(guide, up):
 
 
 def test_the_node_asks_for_the_poses_of_the_plan_and_then_for_refine():
-    guide = guide_at(Guide(), [(0, 0, -1)]).follow([
-        planned((0.0, 0.0, 1.0)), planned((0.0, 1.0, 0.0), temperature=40.0)])
+    guide = guide_at(Guide(planned=(
+        planned((0.0, 0.0, 1.0)), planned((0.0, 1.0, 0.0), temperature=40.0)), begun=1), [
+            (0, 0, -1)])
     assert guide.plan.asked.direction.tolist() == [0.0, 0.0, 1.0]
     guide = guide_at(guide, [(0, 0, -1), (0, 0.1, 1)])
     assert guide.plan.asked.direction.tolist() == [0.0, 1.0, 0.0]

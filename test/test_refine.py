@@ -114,10 +114,11 @@ def test_the_last_step_leaves_what_the_calibration_leaves(taken):
     assert found.steps[-1].gap_after_mg == pytest.approx(found.remaining_gap_mg, rel=1e-6)
 
 
+@pytest.mark.parametrize(('size', 'memory'), [
+    (0.003, 0.0), (0.07, 0.0), (0.003, 0.6), (0.02, 0.6)])
 @pytest.mark.parametrize('form', [0.0, 1.0])
-@pytest.mark.parametrize('size', [0.003, 0.07])
-def test_a_hysteresis_of_any_size_leaves_the_noise_in_new_poses(size, form):
-    hidden = {'hysteresis': [size, -size, 0.7 * size, form]}
+def test_a_hysteresis_of_any_size_leaves_the_noise_in_new_poses(size, form, memory):
+    hidden = {'hysteresis': [size, -size, 0.7 * size, form, memory]}
     poses, fresh = (ac.simulate({**SENSOR, **hidden}, seed=count, poses=count)
                     for count in (48, 200))
     found = ac.refine(poses, base='10')
@@ -140,14 +141,17 @@ def test_a_relaxation_after_turns_is_named_with_its_time_constant(lasting):
     assert ac.verify(tables[1], found.calibration).rms_after_mg < 0.5
 
 
-@pytest.mark.parametrize('warming', [lambda t: 12.0 * t, lambda t: 16.0 - 16.0 * np.exp(-3.0 * t)])
+@pytest.mark.parametrize(('warming', 'step'), [
+    (lambda t: 12.0 * t, 0.5), (lambda t: 12.0 * t, 1.0),
+    (lambda t: 16.0 - 16.0 * np.exp(-3.0 * t), 0.5)])
 @pytest.mark.parametrize('seed', range(2))
-def test_a_thermometer_with_steps_beside_a_ramp_does_not_hide_the_cause(seed, warming):
+def test_a_thermometer_with_steps_beside_a_ramp_does_not_hide_the_cause(seed, step, warming):
     share = np.sort(np.random.default_rng(seed).uniform(size=60))
     temperature = 20.3 + warming(share)
     poses = ac.simulate({**SENSOR, 'offset_temperature': [2e-3, -1e-3, 1e-3]}, poses=60, seed=seed,
                         time=3600.0 * share, temperature=temperature)
-    found = ac.refine(poses.with_columns(temperature=np.round(2.0 * temperature) / 2.0), base='10')
+    stepped = poses.with_columns(temperature=step * np.round(temperature / step))
+    found = ac.refine(stepped, base='10')
     assert (found.verdict, names(found)) == ('explained', ['offset_temperature'])
     assert found.remaining_gap_mg < 0.35  # the noise is 0.3, the steps are as much
 
@@ -169,7 +173,7 @@ def test_a_product_of_two_columns_is_named_and_stored(other, tmp_path):
     assert ac.verify(fresh, stored).rms_after_mg < 0.45  # the noise is 0.3
 
 
-@pytest.mark.parametrize('step', [0.0, 0.01, 0.5, 5.0])
+@pytest.mark.parametrize('step', [0.0, 0.01, 0.5, 1.0, 5.0])
 def test_a_temperature_in_steps_is_estimated_within_half_a_step(step):
     rng = np.random.default_rng(5)
     time = np.sort(rng.uniform(0.0, 3600.0, 60))
@@ -179,7 +183,7 @@ def test_a_temperature_in_steps_is_estimated_within_half_a_step(step):
         stated = np.round(true / step) * step if step else true
         found = between_steps(time, stated)
         assert np.max(np.abs(found - stated)) <= step / 2.0
-        if step == 0.5:
+        if step in (0.5, 1.0):
             assert np.std(found - true) < left * np.std(stated - true)
         else:  # exact, or the temperatures of a chamber
             np.testing.assert_allclose(found, stated, atol=0.01)

@@ -107,12 +107,12 @@ def test_a_command_that_ends_after_another_sensor_took_over_changes_nothing_of_i
     found = result(next(task))
     driver.now += 3.0
     driver.feed(turned[:200], 'other')
-    poses = len(driver.session.sensor.live.book.poses())
+    poses = len(driver.session.sensor.live.poses())
     with pytest.raises(AccelCalibError, match=words):
         task.send(found)
     assert driver.session.state.name == 'other'
     assert driver.session.sensor.calibration is None
-    assert len(driver.session.sensor.live.book.poses()) == poses > 0
+    assert len(driver.session.sensor.live.poses()) == poses > 0
 
 
 def test_files_that_are_read_too_late_are_not_used_for_the_next_sensor(

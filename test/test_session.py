@@ -20,7 +20,7 @@ from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Poses
 from driven import Driver, RATE
 from inside import (
-    Identity, LARGEST_NUMBER_OF_STEPS, Model, poses_changed, rotation_from_rpy, SensorStore,
+    LARGEST_NUMBER_OF_STEPS, Model, poses_changed, rotation_from_rpy, SensorStore,
     spread_directions, store_of, StreamStatistics, use_calibration, writing_advice)
 import numpy as np
 import pytest
@@ -34,33 +34,36 @@ MOUNTING = rotation_from_rpy(*np.radians((5.0, -3.0, 40.0))).T
 pytestmark = pytest.mark.usefixtures('home')
 
 
-IDENTITIES = [
-    Identity('imu_link', '/left/imu/data_raw'), Identity('imu_link', '/right/imu/data_raw'),
-    *(Identity(name, '/imu') for name in (
+SENSORS = [
+    ('', 'imu_link', '/left/imu/data_raw'), ('', 'imu_link', '/right/imu/data_raw'),
+    *(('', name, '/imu') for name in (
         'left/imu', 'left_imu', '/imu_link', 'imu link', 'übung', 'ßbung', '', 'imu', 'a')),
-    *(Identity(name, '/imu', True) for name in (
-        'left/imu', 'left_imu', 'x' * 300, 'x' * 301, 'imu@a'))]
+    *((name, name, '/imu') for name in ('left/imu', 'left_imu', 'x' * 300, 'x' * 301, 'imu@a'))]
+"""Parameter `sensor`, name and topic of sensors."""
 
 
-def test_each_sensor_has_files_of_its_own() -> None:
-    names = [each.file_name for each in IDENTITIES]
-    assert len(set(names)) == len(names)
-    for name in names:
-        assert name == Path(name).name
-        assert len(name) < 200
-        assert not name.startswith('.')
+def test_each_sensor_has_files_of_its_own(home: Path) -> None:
+    files = [store_of(CalibratorSettings(sensor=sensor), name, topic).calibration
+             for sensor, name, topic in SENSORS]
+    assert len(set(files)) == len(files)
+    for file in files:
+        assert file.parent == home
+        assert len(file.name) < 200
+        assert not file.name.startswith('.')
 
 
 def test_plain_names_of_files_are_readable(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    left = Identity('imu_link', '/left/imu/data_raw')
-    assert left.file_name == 'left.imu.data_raw@imu_link.yaml'
-    named = Identity('arm.v2', '/imu', True)
-    assert store_of('', named, 'm/s2').calibration == home / 'arm.v2.yaml'
-    assert store_of('', named, 'm/s2').poses == home / 'arm.v2_poses.csv'
+    left = store_of(CalibratorSettings(), 'imu_link', '/left/imu/data_raw')
+    assert left.calibration == home / 'left.imu.data_raw@imu_link.yaml'
+    arm = CalibratorSettings(sensor='arm.v2')
+    assert store_of(arm, 'arm.v2', '/imu').calibration == home / 'arm.v2.yaml'
+    assert store_of(arm, 'arm.v2', '/imu').poses == home / 'arm.v2_poses.csv'
     monkeypatch.delenv('ROS_HOME')
     monkeypatch.setenv('HOME', '/me')
-    assert store_of('', named, 'm/s2').calibration == Path('/me/.ros/accel_calib/arm.v2.yaml')
-    assert store_of('~/x.yaml', named, 'm/s2').calibration == Path('/me/x.yaml')
+    assert store_of(arm, 'arm.v2', '/imu').calibration == (
+        Path('/me/.ros/accel_calib/arm.v2.yaml'))
+    given = store_of(CalibratorSettings(calibration_file='~/x.yaml'), 'arm.v2', '/imu')
+    assert given.calibration == Path('/me/x.yaml')
 
 
 def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
@@ -104,7 +107,7 @@ def test_files_that_cannot_be_used_are_never_overwritten(tmp_path: Path, stored:
 
 @pytest.mark.parametrize('changes', [{'sensor': 'another'}, {'units': 'g'}])
 def test_poses_of_another_sensor_or_unit_are_renamed(changes: Any) -> None:
-    store = store_of('', Identity('arm', '/imu', True), 'm/s2')
+    store = store_of(CalibratorSettings(sensor='arm'), 'arm', '/imu')
     store.save_poses(Poses({'reading': np.array([[0.1, 0.2, 9.8]])}, np.array([1])))
     write_table(store.poses, replace(read_poses(store.poses), **changes))
     driver = Driver(sensor='arm')
@@ -401,7 +404,7 @@ def test_steps_back_are_kept_for_changes_only_and_have_a_limit(
         stored: Stored, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(*LARGEST_NUMBER_OF_STEPS, 3)
     path = stored(sensor='imu_link')
-    store = SensorStore(path, Identity('imu_link', '/imu/data_raw'), 'm/s2')
+    store = SensorStore(path, 'imu_link', '/imu/data_raw', 'm/s2')
     first = store.load_calibration()
     store.write(store.prepared(first))
     before = len(store.steps())
@@ -420,7 +423,7 @@ def test_a_step_that_cannot_be_used_leaves_the_file_in_use(stored: Stored) -> No
     before = path.read_text()
     step = path.with_name(f'{path.name}.before1')
     step.write_text(before.replace('readings: m/s2', 'readings: native'))
-    store = SensorStore(path, Identity('imu_link', '/imu/data_raw'), 'm/s2')
+    store = SensorStore(path, 'imu_link', '/imu/data_raw', 'm/s2')
     with pytest.raises(StoredCalibrationError, match='is for readings in native'):
         store.step_back()
     assert path.read_text() == before
@@ -594,7 +597,7 @@ def test_a_start_without_a_column_leaves_it_in_the_stored_poses(
         driver.tick()
         assert np.sum(np.isnan(driver.poses[column])) == lack
         assert ('1 of 5 poses' in driver.logged('info')) is (k == 2 and bool(known))
-        assert column not in driver.sensor.live.poses(()) or not lack
+        assert column not in driver.sensor.live.poses_for_fit(()) or not lack
         driver.session.close()
         if k == 1:
             with open_log(driver.session.state.files.store.poses) as log:  # as a command reads it

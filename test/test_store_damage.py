@@ -14,16 +14,16 @@ from typing import Any
 
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.finding import Level
+from accel_calib.session import CalibratorSettings
 from accel_calib.stored import read_calibration
-from inside import (
-    aside, Identity, lock_files, MOST_BYTES, SensorStore, spread_directions, store_of)
+from inside import aside, MOST_BYTES, SensorFiles, SensorStore, spread_directions, store_of
 import numpy as np
 import pytest
 from shared import Readings, Stored
 from test_session import Driver
 
 NOBODY = 65534
-IDENTITY = Identity('imu_link', '/imu/data_raw')
+IDENTITY = 'imu_link', '/imu/data_raw'
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ OF_POSES: dict[str, Callable[[Path], object]] = {
 @pytest.fixture
 def store(stored: Stored) -> SensorStore:
     """Return a store with a calibration and 12 poses."""
-    made = SensorStore(stored(sensor='imu_link'), IDENTITY, 'm/s2')
+    made = SensorStore(stored(sensor='imu_link'), *IDENTITY, 'm/s2')
     made.save_poses(read_calibration(made.calibration).poses.take(slice(0, 12)))
     return made
 
@@ -105,7 +105,7 @@ def works(path: Path, readings: Readings) -> None:
     after = Driver(calibration_file=str(path))
     after.feed(readings([[0, 0, 1]])[:10])
     assert after.session.sensor.calibration is not None
-    assert len(after.session.sensor.live.book.poses()) >= 10
+    assert len(after.session.sensor.live.poses()) >= 10
     assert not after.logged()
     after.session.close()
 
@@ -122,7 +122,7 @@ def test_whatever_is_in_place_of_a_file_is_kept_and_replaced(
     driver = Driver(calibration_file=str(store.calibration))
     assert path.name in driver.logged()
     assert (driver.session.sensor.calibration is not None) is of_poses
-    assert len(driver.session.sensor.live.book.poses()) == (0 if of_poses else 12)
+    assert len(driver.session.sensor.live.poses()) == (0 if of_poses else 12)
     driver.session.close()
     works(store.calibration, readings)
     assert found in [kept(each) for each in store.calibration.parent.iterdir()]
@@ -180,7 +180,7 @@ def test_what_does_not_look_like_a_file_is_never_renamed_or_replaced(
 
 def test_files_that_nobody_may_read_are_kept_and_replaced(folder: Path, readings: Readings
                                                           ) -> None:
-    store = SensorStore(folder / 'imu.yaml', IDENTITY, 'm/s2')
+    store = SensorStore(folder / 'imu.yaml', *IDENTITY, 'm/s2')
     for path in (store.calibration, store.poses):
         path.write_text('secret')
         path.chmod(0)
@@ -220,7 +220,7 @@ def test_a_path_that_no_file_can_have_is_reported(name: str, tmp_path: Path, rea
 
 def test_a_home_that_is_not_known_is_refused_in_one_line() -> None:
     with pytest.raises(InputError, match='has no home folder; state the whole path'):
-        store_of('~nobody_has_this_name/imu.yaml', IDENTITY, 'm/s2')
+        store_of(CalibratorSettings(calibration_file='~nobody_has_this_name/imu.yaml'), *IDENTITY)
 
 
 # Lock and steps
@@ -236,7 +236,7 @@ def test_whatever_is_in_place_of_the_lock_is_left_as_it_is(
     lock = store.calibration.with_name('known.lock')
     make(lock)
     before = kept(lock)
-    lock_files(store).close()
+    SensorFiles(store).take().release()
     assert kept(lock) == before
     assert precious.read_text() == 'kept'
     assert Driver(calibration_file=str(store.calibration)).session.sensor.calibration

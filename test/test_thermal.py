@@ -47,7 +47,8 @@ def test_low_pass_of_a_ramp_and_of_a_cubic_temperature_with_its_rates_is_exact(a
     bend, twist = 6 * a * time + 2 * b, 6 * a
     steady = warm - lag * rate + lag ** 2 * bend - lag ** 3 * twist
     expected = steady + (warm - steady)[0] * np.exp(-(time - time[0]) / lag)
-    found = low_passed(START + time, warm, lag, rate if known else None)
+    found = (low_passed(START + time, warm, lag, rate) if known else
+             ThermalStream({KEY: Lag(lag, False)}, rate=False).add_all(START + time, warm)[KEY])
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
@@ -57,9 +58,11 @@ def test_order_of_the_rows_and_rows_without_values_do_not_matter():
     warm = 20.0 + np.cumsum(rng.normal(size=50))
     mixed = rng.permutation(52)
     given = np.append(time, [np.nan, time[3]])[mixed], np.append(warm, [20.0, np.nan])[mixed]
-    for function, of in ((rate_of, ()), (low_passed, (70.0,))):
-        expected = np.append(function(time, warm, *of), [np.nan, np.nan])[mixed]
-        np.testing.assert_allclose(function(*given, *of), expected, atol=1e-9)
+    lags = {KEY: Lag(70.0, False)}
+    for function in (rate_of, lambda *rows: low_passed(*rows, 70.0, rate_of(*rows)),
+                     lambda *rows: ThermalStream(lags, rate=False).add_all(*rows)[KEY]):
+        expected = np.append(function(time, warm), [np.nan, np.nan])[mixed]
+        np.testing.assert_allclose(function(*given), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize('spacing', [10.0, 20.0, 30.0, 60.0])
@@ -94,7 +97,7 @@ def test_temperature_ahead_of_a_lagging_sensor_is_found_in_a_stream(lag):
 LAGS = {KEY: Lag(40.0, True), 'temperature_of_gain': Lag(25.0, False)}
 
 
-def test_stream_and_array_give_the_same_numbers_over_a_pause_and_missing_temperatures():
+def test_samples_added_alone_and_together_are_the_same_over_a_pause_and_missing_temperatures():
     rng = np.random.default_rng(3)
     time = START + np.cumsum(rng.uniform(0.0, 0.4, 3000))
     time[1500:] += 500.0

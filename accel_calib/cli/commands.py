@@ -130,23 +130,21 @@ def _port(text: str) -> int:
     return port
 
 
-def _calibration_of_logs(*names: str) -> Options:
-    """Return the options of a command from logs to a calibration and a page beside it."""
-    return (
-        option('-o', '--output', type=Path, default=Path('calibration.yaml'), metavar='FILE',
-               help='calibration to write (default: %(default)s); the page has the same name with '
-               '.html'),
-        option('--flat', type=_flat, metavar='ROW', help='pose with the robot level: its row, '
-               '1-based, or first or last; it determines the mounting'),
-        *shared('--nose-down', '--frame', '--keep-bad', *names, '--verbose', '--json'), *LOG,
-        *CAPTURE)
-
+_FROM_LOGS: Options = (
+    option('-o', '--output', type=Path, default=Path('calibration.yaml'), metavar='FILE',
+           help='calibration to write (default: %(default)s); the page has the same name with '
+           '.html'),
+    option('--flat', type=_flat, metavar='ROW', help='pose with the robot level: its row, '
+           '1-based, or first or last; it determines the mounting'),
+    *shared('--nose-down', '--frame', '--keep-bad'))
+"""Options of a command from logs to a calibration and a page beside it."""
 
 _CALIBRATIONS: Options = (
     option('calibrations', nargs='+', type=Path, metavar='CALIBRATION',
            help='two or more stored calibrations of one sensor, in any order'),
     report(), *shared('--json'))
 
+_FLEET = ('--prior', '--sensor-model')
 _OUTPUT = {'type': Path, 'required': True}
 _EXPORT = {'of': late('stored.exports', 'Options')}
 
@@ -174,7 +172,7 @@ COMMANDS = {
     'calibrate': Command(
         'make a calibration, a page and a verdict from any log', 'fit', 'log.csv --flat last', (
             source('log', any_log('recording or pose table: ')),
-            *_calibration_of_logs('--prior', '--sensor-model', '--no-refine')),
+            *_FROM_LOGS, *shared(*_FLEET, '--no-refine', '--verbose', '--json'), *LOG, *CAPTURE),
         writes='calibration', about='log'),
     'thermal': Command(
         'fit the offset over temperature to logs of a still board that warms up', 'fit',
@@ -182,7 +180,8 @@ COMMANDS = {
             source('logs', 'log of a still board whose temperature changes; several are fitted '
                    'together, and one of them may be of poses in many directions', nargs='+',
                    metavar='LOG'),
-            *_calibration_of_logs()), writes='calibration', about='logs'),
+            *_FROM_LOGS, *shared('--verbose', '--json'), *LOG, *CAPTURE),
+        writes='calibration', about='logs'),
     'capture': Command(
         'find the still stretches of a recording and write the pose table', 'fit',
         'recording.mcap -o poses.csv', (
@@ -202,8 +201,8 @@ COMMANDS = {
                    'every row'),
             option('--flat', type=int, metavar='ROW', help='row of a pose with the robot level, '
                    '1-based; it determines the mounting'),
-            *shared('--nose-down', '--frame', '--keep-bad', '--prior', '--sensor-model',
-                    '--verbose')), writes='calibration'),
+            *shared('--nose-down', '--frame', '--keep-bad', *_FLEET, '--verbose')),
+        writes='calibration'),
     'verify': Command(
         'evaluate a calibration on poses that it was not fitted to', 'compare',
         'other_log.csv -c calibration.yaml --max 5\n'

@@ -11,15 +11,15 @@ from typing import Any
 
 from rich.table import Table
 
-from .frame import (
-    Done, FAILED, intake, log_options, rated, rating_lines, read_lines, rows_between,
-    stored_calibration)
-from .output import error_line, NARROW, progress, short_if_known, table, Verdict
+from .commands import next_command
+from .frame import Done, FAILED, intake, log_options, read_lines, rows_between, stored_calibration
+from .output import NARROW, progress, short_if_known, table, Verdict
 from ..calibration import verify
-from ..comparison import compare, History, history_of
+from ..comparison import compare, history_of
 from ..errors import InputError
 from ..findings import (
-    change_in_words, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, rate_verification)
+    change_words, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, rate_verification,
+    rating_json)
 from ..logs import open_log
 from ..noise import check_allantools, duration, noise_of, to_json, whole
 from ..pipeline import Correction
@@ -28,7 +28,7 @@ from ..report.stability import (
     comparison_page, figure_rows, history_page, kalibr_lines, need_lines, noise_page,
     parameter_rows)
 from ..stored import read_calibration
-from ..table import check_units
+from ..table import check_units, Recording
 from ..text import counted, plain, short
 from ..units import units_of
 
@@ -45,9 +45,11 @@ def run_verify(args: argparse.Namespace) -> Done:
     lines = [*found.lines, *(each.words for each in poses.findings)]
     page = partial(calibration_page, calibration, rating, str(args.poses), notes=lines,
                    verification=(verification, poses), stored=str(args.calibration))
+    command = next_command(rating.next, args)
     result = {'file': args.poses, 'poses': len(poses), **asdict(verification),
-              **rated(rating, args), 'read_as': found.read_as, 'read_lines': lines,
-              'rating_lines': [str(line) for line in rating_lines(rating, args)]}
+              **rating_json(rating, rating.next, command), 'read_as': found.read_as,
+              'read_lines': lines,
+              'rating_lines': [*rating.lines, *([f'      {command}'] if command else [])]}
     above = args.max is not None and not verification.rms_after_mg <= args.max
     result |= {} if args.max is None else {'max_mg': args.max, 'above_max': above}
     return Done(result, several_verify([plain(result)]), status=FAILED if above else 0, page=page)
@@ -57,8 +59,9 @@ def several_verify(results: Sequence[dict[str, Any]]) -> Iterator[Any]:
     """Yield how the logs were read, a row for each, and the ratings."""
     names = [f'{result["file"]}: ' if len(results) > 1 else '' for result in results]
     for name, result in zip(names, results, strict=True):
-        for line in (error_line(result),) if 'error' in result else result['read_lines']:
-            yield f'{name}{line}'
+        yield from (f'{name}{line}' for line in result.get('read_lines', ()))
+        if 'error' in result:
+            yield f'{name}{result["error"]}; {result["advice"]}'
     yield table(
         'Residual of |force| over these poses [mg]',
         ('poses', 'before', 'after', 'largest after', 'noise floor'),
@@ -103,15 +106,29 @@ def run_compare(args: argparse.Namespace) -> Done:
 def run_history(args: argparse.Namespace) -> Done:
     """Sort calibrations by date, and compare them; in JSON, runs are numbered from 1."""
     calibrations = [read_calibration(path, args.own) for path in args.calibrations]
-    history = history_of(calibrations)
-    paths, changes = args.calibrations, []
+    history, rows, lines, changes = history_of(calibrations), [], list[str](), []
+    paths, labels = args.calibrations, history.labels
+    found = {each.name: each for each in history.parameters}
+    for k, (label, moment) in enumerate(zip(labels, history.moments, strict=True)):
+        warm = '' if moment.temperature is None else f'{moment.temperature:.0f} °C'
+        for begin, names in zip((label, warm, ''), zip(OFFSETS, GAINS, strict=True), strict=True):
+            cells = (in_words(name, found[name].values[k], found[name].stated_sd[k])
+                     for name in names)
+            rows.append((begin, names[0][-1], *(cell.rpartition(' ')[0].replace('−', '-')
+                                                for cell in cells)))
     for number, change in enumerate(history.changes, 1):
-        rating, comparison = rate_comparison(change.comparison), change.comparison
+        comparison, most = change.comparison, change_words(
+            change.parameter, change.change, change.sd).replace('−', '-')
+        rating = rate_comparison(comparison)
         changes.append({
             'from': number, 'to': number + 1, 'agree': comparison.agree,
             'p_value': comparison.p_value, 'rms_mg': comparison.runs[1].rms_mg,
             'largest_mg': comparison.runs[1].largest_mg, 'parameter': change.parameter,
-            'change': change.change, 'change_sd': change.sd, **rated(rating, args)})
+            'change': change.change, 'change_sd': change.sd,
+            **rating_json(rating, rating.next, next_command(rating.next, args))})
+        verdict = 'agree' if comparison.agree else 'differ'
+        lines.append(f'{labels[number - 1]} to {labels[number]}: {verdict} (p = '
+                     f'{comparison.p_value:.2g}), {rating.name}; largest change: {most}')
     result = {
         'agree': history.whole.agree, 'p_value': history.whole.p_value,
         'runs': [{'file': paths[moment.index], 'date': moment.when and moment.when.isoformat(),
@@ -120,32 +137,9 @@ def run_history(args: argparse.Namespace) -> Done:
         'parameters': [{'name': each.name, 'values': each.values, 'stated_sd': each.stated_sd}
                        for each in history.parameters],
         'changes': changes, 'notes': history.notes}
-    return Done(result, _history_lines(history),
-                page=partial(history_page, history, paths, calibrations))
-
-
-def _history_lines(history: History) -> Iterator[Any]:
-    """Yield offset and gain, one row per calibration and axis, and a line for each change."""
-    rows = []
-    found = {each.name: each for each in history.parameters}
-    for k, (label, moment) in enumerate(zip(history.labels, history.moments, strict=True)):
-        warm = '' if moment.temperature is None else f'{moment.temperature:.0f} °C'
-        for begin, names in zip((label, warm, ''), zip(OFFSETS, GAINS, strict=True), strict=True):
-            cells = (in_words(name, found[name].values[k], found[name].stated_sd[k])
-                     for name in names)
-            rows.append((begin, names[0][-1], *(cell.rpartition(' ')[0].replace('−', '-')
-                                                for cell in cells)))
-    yield table('', ('date', '', 'offset [mg]', 'gain - 1 [%]'), rows, show_edge=False, **NARROW)
-    for first, second, change in zip(history.labels, history.labels[1:], history.changes,
-                                     strict=False):
-        comparison = change.comparison
-        verdict = 'agree' if comparison.agree else 'differ'
-        most = change_in_words(change.parameter, change.change, change.sd).replace('−', '-')
-        yield (f'{first} to {second}: {verdict} (p = {comparison.p_value:.2g}), '
-               f'{rate_comparison(comparison).name}; largest change: '
-               f'{change.parameter.replace(".", " ")} {most}')
-    for note in history.notes:
-        yield f'note: {note}'
+    shown = [table('', ('date', '', 'offset [mg]', 'gain - 1 [%]'), rows, show_edge=False,
+                   **NARROW), *lines, *(f'note: {note}' for note in history.notes)]
+    return Done(result, shown, page=partial(history_page, history, paths, calibrations))
 
 
 def run_noise(args: argparse.Namespace) -> Done:
@@ -157,7 +151,7 @@ def run_noise(args: argparse.Namespace) -> Done:
             with progress('samples') as moved:
                 recording = whole(log.watched(moved))
         elif 'time' in log.poses and 'count' not in log.poses:
-            recording = log.poses.as_recording()  # a table of slow samples looks like poses
+            recording = Recording(**vars(log.poses))  # a table of slow samples looks like poses
         else:
             raise InputError(f'{args.recording} is a pose table, expected a recording',
                              'use the samples of a long rest, with their time')

@@ -23,22 +23,22 @@ import numpy as np
 from rich.table import Table
 
 from .frame import (
-    check_target, console, Done, FAILED, given, intake, log_options, prior, read_lines,
-    rows_between, settings, stored_calibration, Target)
-from .output import error_line, Output, progress, short_if_known, table, Verdict, working
+    check_target, console, Done, FAILED, given, intake, log_options, read_lines, rows_between,
+    stored_calibration, Target)
+from .output import Output, progress, short_if_known, table, Verdict, working
 from ..calibration import Calibration, NORM_MODELS
 from ..disk import STANDARD_OUTPUT, write_atomically
 from ..effects import AXES, entry_of, parse_effect
 from ..errors import InputError
 from ..findings import (
-    base_words, calibration_json, chance_words, curve_json, effect_figures, linear_figures,
-    outlook, plan_lines, rate_refinement, refinement_json, request_words, rival_words, value_words,
-    verdict_words)
+    base_words, calibration_json, chance_words, effect_figures, linear_figures, outlook,
+    plan_lines, rate, refinement_json, request_words, rival_words, value_words, verdict_words)
 from ..logs import is_bag, open_log, write_blocks, write_table
 from ..pipeline import (
     calibrated, calibrated_log, captured_from, Correction, Intake, Outcome, Plan, ramp_or_poses,
     RampIntake, thermally_calibrated, ThermalOutcome)
-from ..stored import write_calibration
+from ..stillness import CaptureSettings
+from ..stored import read_prior, write_calibration
 from ..text import counted, listed, now, short, with_sd
 from ..units import MG
 
@@ -53,7 +53,7 @@ def run_fit(args: argparse.Namespace) -> Done:
         outcome = calibrated(found.poses, found.units, plan_of(args, rows=rows, refined=False))
     calibration = outcome.calibration
     ahead = outlook(calibration, args.model)
-    return _done(
+    return _store(
         args, outcome, {'file': args.poses, **calibration_json(calibration, ahead),
                         'read_as': found.read_as, 'read_lines': found.lines},
         shown=_tables(calibration), page=partial(_page, args, args.poses, found, outcome),
@@ -66,10 +66,10 @@ def run_calibrate(args: argparse.Namespace) -> Done:
     with intake(args, args.log) as found, working('fitting'):
         outcome = calibrated_log(args.log, log_options(args), found, plan_of(args))
     if isinstance(outcome, ThermalOutcome):
-        return _thermal_done(args, [args.log], outcome,
-                             'its temperature changes: fitted as by accel-calib thermal')
+        return _store_thermal(args, [args.log], outcome,
+                              'its temperature changes: fitted as by accel-calib thermal')
     calibration, refinement = outcome.calibration, outcome.refinement
-    return _done(
+    return _store(
         args, outcome,
         {'file': args.log, **calibration_json(calibration, outlook(calibration, 'auto')),
          'read_as': found.read_as, 'read_lines': found.lines, 'refined': outcome.line,
@@ -84,14 +84,15 @@ def run_thermal(args: argparse.Namespace) -> Done:
     found = []
     for path in args.logs:
         with progress('samples') as moved:
-            found.append(ramp_or_poses(path, log_options(args), settings(args), moved))
+            found.append(ramp_or_poses(path, log_options(args), given(CaptureSettings, args),
+                                       moved))
     with working('fitting'):
         outcome = thermally_calibrated(found, Plan(**given(Plan, args)))
-    return _thermal_done(args, args.logs, outcome)
+    return _store_thermal(args, args.logs, outcome)
 
 
-def _thermal_done(args: argparse.Namespace, logs: Sequence[Path], outcome: ThermalOutcome,
-                  *notes: str) -> Done:
+def _store_thermal(args: argparse.Namespace, logs: Sequence[Path], outcome: ThermalOutcome,
+                   *notes: str) -> Done:
     """Store, and return what is done, with further notes on the logs."""
     from ..report import thermal_page
 
@@ -103,10 +104,14 @@ def _thermal_done(args: argparse.Namespace, logs: Sequence[Path], outcome: Therm
         values.add_row(each.label, with_sd(each.value, each.sd), each.unit)
     low, high = curve.range_c
     errors = [*curve.held_out_mg.values()]
-    return _done(
+    return _store(
         args, outcome,
         {'file': list(logs), **calibration_json(calibration, outlook(calibration, 'auto')),
-         'read_as': outcome.read_as, 'read_lines': lines, 'thermal': curve_json(curve)},
+         'read_as': outcome.read_as, 'read_lines': lines, 'thermal': {
+             'reference_c': curve.reference_c, 'range_c': curve.range_c, 'degree': curve.degree,
+             'effects': [*map(str, curve.model.effects)], 'band_mg': curve.band_mg,
+             'change_mg': curve.change_mg, 'residual_mg': curve.residual_mg,
+             'held_out_mg': curve.held_out_mg}},
         shown=[values if curve.model.effects else
                'the offset does not change with the temperature',
                f'degree {curve.degree} from {low:.1f} to {high:.1f} °C: {short(curve.change_mg)} '
@@ -120,16 +125,17 @@ def _thermal_done(args: argparse.Namespace, logs: Sequence[Path], outcome: Therm
 
 def plan_of(args: argparse.Namespace, **more: Any) -> Plan:
     """Return how to calibrate; raise InputError if ``--prior`` stands with another model."""
-    plan = Plan(**{**given(Plan, args), 'fleet': prior(args), 'also': args.own, **more})
+    fleet = args.prior and read_prior(args.prior, args.sensor_model)
+    plan = Plan(**{**given(Plan, args), 'fleet': fleet, 'also': args.own, **more})
     usual = plan.model in ('auto', NORM_MODELS[-1]) and plan.method == 'ml'
-    if plan.fleet is not None and not usual:
+    if fleet is not None and not usual:
         raise InputError(f'--prior with --model {plan.model} --method {plan.method}, expected '
                          'model 10 by maximum likelihood', 'leave out these options')
     return plan
 
 
-def _done(args: argparse.Namespace, outcome: Outcome | ThermalOutcome, result: dict[str, Any], *,
-          shown: Iterable[Any], page: Callable[[], str], notes: Sequence[str]) -> Done:
+def _store(args: argparse.Namespace, outcome: Outcome, result: dict[str, Any], *,
+           shown: Iterable[Any], page: Callable[[], str], notes: Sequence[str]) -> Done:
     """
     Write a calibration unless it is BAD, and return what is done.
 
@@ -161,11 +167,11 @@ def _page(args: argparse.Namespace, log: Path, found: Intake, outcome: Outcome) 
                             stored=str(args.output or 'calibration.yaml'))
 
 
-def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str]:
+def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str | Verdict]:
     """Yield a line for each of several results."""
     for result in results:
         if 'error' in result:
-            yield f'{result["file"]} {error_line(result)}'
+            yield f'{result["file"]} {result["error"]}; {result["advice"]}'
             continue
         line = (f'{result["file"]} model {result["model"]}: {result["rms_before_mg"]:.3g} -> '
                 f'{result["rms_after_mg"]:.3g} mg, ')
@@ -203,10 +209,10 @@ def _tables(calibration: Calibration) -> Iterator[Any]:
 
 def run_refine(args: argparse.Namespace) -> Done:
     """Refine a calibration, and store it unless it is refused."""
-    from ..report import refinement_page
+    from ..report import calibration_page
 
     found, result = _refined(args)
-    stored = []
+    rating, stored = rate(result.calibration, refinement=result), list[Path]()
     if args.output is not None and not result.refusal:
         write_calibration(args.output, result.calibration)
         stored.append(args.output)
@@ -215,12 +221,24 @@ def run_refine(args: argparse.Namespace) -> Done:
 
         write_plan(args.plan, result.plan)
         stored.append(args.plan)
+    table = Table(title=f'From {base_words(result)}: residuals in mg, held out in brackets',
+                  show_lines=True)
+    table.add_column('effect, and where it was found', overflow='fold')
+    for name in ('residual', 'chance'):
+        table.add_column(name, no_wrap=True)
+    for number, step in enumerate(result.steps, 1):
+        gap = (f'{short(step.gap_before_mg)} -> {short(step.gap_after_mg)}\n'
+               f'({short(step.held_out_before_mg)} -> {short(step.held_out_after_mg)})')
+        lines = [f'{number}. {step.effect}', entry_of(step.name).words,
+                 ', '.join(f'{name} {value}'.lstrip() for name, value in value_words(step)),
+                 step.where, f'rivals: {", ".join(rival_words(step)) or "none"}']
+        table.add_row('\n'.join(filter(None, lines)), gap, chance_words(step.p_value))
     rows, missing = result.disturbed_poses, [name for name, _ in result.not_testable]
+    plan = [f'plan: {line}' for line in plan_lines(result.plan)] if args.plan is not None else []
     return Done({'file': args.poses, **refinement_json(result), 'read_as': found.read_as},
-                [*([_steps_table(result)] if result.steps else ()),
-                 *(f'plan: {line}' for line in plan_lines(result.plan) if args.plan is not None)],
-                rate_refinement(result), stored=stored,
-                page=partial(refinement_page, result, str(args.poses)),
+                [*([table] if result.steps else ()), *plan], rating, stored=stored,
+                page=partial(calibration_page, result.calibration, rating, str(args.poses),
+                             refinement=result),
                 refusal=result.refusal if args.output else (),
                 notes=[verdict_words(result),
                        *([f'left out: {listed("row", rows)}'] if rows else ()),
@@ -247,7 +265,8 @@ def _refined(args: argparse.Namespace) -> tuple[Intake, Refinement]:
     stored = args.calibration and stored_calibration(args.calibration, args.own)
     with intake(args, args.poses, stored) as found, working('refining'):
         poses = found.poses.take(rows_between(found.poses, args.rows))
-        base = stored.in_units(found.units) if stored else prior(args) or args.base
+        base = (stored.in_units(found.units) if stored else
+                read_prior(args.prior, args.sensor_model) if args.prior else args.base)
         return found, refine(poses, found.units, base=base, sensor=args.sensor, date=now(),
                              also=args.own)
 
@@ -255,29 +274,12 @@ def _refined(args: argparse.Namespace) -> tuple[Intake, Refinement]:
 def several_refine(results: Sequence[dict[str, Any]]) -> Iterator[str]:
     """Yield a line for each of several results."""
     for result in results:
-        line = error_line(result)
+        line = f'{result["error"]}; {result["advice"]}' if 'error' in result else ''
         if not line:
             names = ' + '.join([result['base'], *(step['effect'] for step in result['steps'])])
             line = (f'{result["verdict"]}: {names}, {short(result["gap_mg"])} -> '
                     f'{short(result["remaining_gap_mg"])} mg')
         yield f'{result["file"]}: {line}'
-
-
-def _steps_table(result: Refinement) -> Table:
-    """Return a table of the steps."""
-    table = Table(title=f'From {base_words(result)}: residuals in mg, held out in brackets',
-                  show_lines=True)
-    table.add_column('effect, and where it was found', overflow='fold')
-    for name in ('residual', 'chance'):
-        table.add_column(name, no_wrap=True)
-    for number, step in enumerate(result.steps, 1):
-        gap = (f'{short(step.gap_before_mg)} -> {short(step.gap_after_mg)}\n'
-               f'({short(step.held_out_before_mg)} -> {short(step.held_out_after_mg)})')
-        lines = [f'{number}. {step.effect}', entry_of(step.name).words,
-                 ', '.join(f'{name} {value}'.lstrip() for name, value in value_words(step)),
-                 step.where, f'rivals: {", ".join(rival_words(step)) or "none"}']
-        table.add_row('\n'.join(filter(None, lines)), gap, chance_words(step.p_value))
-    return table
 
 
 # ----------------------------------------------------------------------------- fleets
@@ -289,7 +291,8 @@ def run_fleet(args: argparse.Namespace) -> Done:
     with working('looking for recordings'):
         found = list({each.path: each for each in recordings(args.recordings)}.values())
     asked = Options(**{**given(Options, args), 'log': log_options(args),
-                       'settings': settings(args), 'exports': tuple(dict.fromkeys(args.export))})
+                       'settings': given(CaptureSettings, args),
+                       'exports': tuple(dict.fromkeys(args.export))})
     with cluster(args.scheduler, args.workers) as client:
         console(args).print(f'{counted(len(found), "recording")}; dashboard: '
                             f'{client.dashboard_link}')
@@ -316,7 +319,8 @@ def run_fleet(args: argparse.Namespace) -> Done:
 def run_capture(args: argparse.Namespace) -> Done:
     """Find the still stretches of a recording, and write the poses."""
     with progress('samples') as moved:
-        found, captured = captured_from(args.recording, log_options(args), settings(args), moved)
+        found, captured = captured_from(args.recording, log_options(args),
+                                        given(CaptureSettings, args), moved)
     write_table(args.output, found.poses)
     lines = [*found.lines, *(f'note: {each.words}' for each in found.poses.findings)]
     for item in captured.interruptions:

@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 from .commands import COMMANDS, next_command
 from .options import BAD_INPUT, STANDARD_INPUT
 from .output import Output, progress, Verdict, working
-from ..calibration import Calibration, FleetPrior
+from ..calibration import Calibration
 from ..disk import replaceable, STANDARD_OUTPUT, write_atomically
 from ..effects import effects_of_file, OwnEffect
 from ..errors import AccelCalibError, InputError, known_error, RefusedFitError, saying
@@ -39,7 +39,7 @@ from ..findings import Rating, rating_json
 from ..logs import LogOptions, named_topics, OpenLog
 from ..pipeline import Intake, options_for, poses_of
 from ..stillness import CaptureSettings
-from ..stored import calibration_from, OF_FILE, read_calibration, read_prior
+from ..stored import calibration_from, OF_FILE, read_calibration
 from ..table import Poses
 from ..text import counted, plain
 
@@ -58,6 +58,8 @@ _KINDS = {'calibration': rb'format: accel_calib', 'page': rb'<!DOCTYPE html',
           'export': rb'(?s).*(written by accel-calib|accel_calib) export'}
 """Beginning of a file of each kind."""
 
+_PIPED = Path(STANDARD_OUTPUT)
+
 _MOST_NOTES = 5
 """Largest number of notes without ``--verbose``."""
 
@@ -71,7 +73,7 @@ class Done:
     the most important first, of which a few are shown without ``--verbose``, and then by `shown`,
     texts and tables, which are made when they are printed. `stored` are the files written. `page`
     returns the page, if one is asked for. `refusal` is why the file of ``-o`` is not written, and
-    what to do.
+    what to do. `error` is why nothing was done; `result` then states it.
 
     """
 
@@ -83,6 +85,7 @@ class Done:
     page: Callable[[], str] | None = None
     refusal: tuple[str, ...] = ()
     notes: Sequence[str] = ()
+    error: AccelCalibError | OSError | None = None
 
 
 class Target(NamedTuple):
@@ -93,11 +96,6 @@ class Target(NamedTuple):
     kind: str
     option: str
 
-    @property
-    def is_piped(self) -> bool:
-        """Whether it is standard output."""
-        return str(self.path) == STANDARD_OUTPUT
-
 
 def run(args: argparse.Namespace) -> int:
     """
@@ -107,15 +105,34 @@ def run(args: argparse.Namespace) -> int:
     written; ``--json`` then has the error, too.
 
     """
-    each = _for_each(args)
-    _check_targets(args, each)
-    if args.command not in _WITH_PAGE and _page_of(args) is not None:
+    sources, outputs, each = getattr(args, 'poses', None), _outputs(args), [args]
+    if isinstance(sources, list):  # of several POSES, outputs are folders
+        folders = [target for target in outputs if len(sources) > 1 and target.kind in _SUFFIXES]
+        each = [argparse.Namespace(**{**vars(args), 'poses': source, **{
+            target.name: target.path / f'{Path(source).stem}{_SUFFIXES[target.kind]}'
+            for target in folders}}) for source in sources]
+    _check_targets(args, outputs, each)
+    if args.command not in _WITH_PAGE and any(target.kind == 'page' for target in outputs):
         from ..report import check_matplotlib
 
         check_matplotlib()
     if len(each) == 1:
         return _run_one(each[0])
-    outcomes = _in_parallel(_attempt, each, args.jobs)
+    if args.jobs <= 1:
+        outcomes = [*map(_attempt, each)]
+    else:
+        from concurrent.futures import ThreadPoolExecutor
+        from threading import local
+
+        from ..session import WorkerProcess
+
+        own, workers = local(), ExitStack()
+
+        def begin() -> None:
+            own.worker = workers.enter_context(closing(WorkerProcess(idle=False)))
+
+        with ThreadPoolExecutor(min(args.jobs, len(each)), initializer=begin) as pool, workers:
+            outcomes = list(pool.map(lambda one: own.worker.call(_attempt, one), each))
     results = [result for _, result in outcomes]
     write_json(args.json, results)
     output = console(args)
@@ -129,57 +146,57 @@ def _function(kind: str, command: str) -> Callable[[Any], Any]:
     return getattr(module, f'{kind}_{command}')
 
 
-def _page_of(args: argparse.Namespace) -> Path | None:
-    """Return the page that is asked for, or is beside the calibration."""
-    if args.command in _WITH_PAGE:
-        return None if str(args.output) == STANDARD_OUTPUT else args.output.with_suffix('.html')
-    name = 'output' if COMMANDS[args.command].writes == 'page' else 'report'
-    return getattr(args, name, None)
-
-
-def _done(args: argparse.Namespace) -> Done:
+def _carry_out(args: argparse.Namespace) -> Done:
     """Run the command for one input, with the own effects of the user, and draw its page."""
-    path, page = getattr(args, 'also', None), _page_of(args)
-    args.own = () if path is None else effects_of_file(path)
-    done: Done = _function('run', args.command)(args)
-    if page is not None and done.page is not None:
-        from ..report import check_matplotlib, write_page
+    also = getattr(args, 'also', None)
+    page = next((target.path for target in _outputs(args) if target.kind == 'page'), None)
+    try:
+        args.own = () if also is None else effects_of_file(also)
+        done: Done = _function('run', args.command)(args)
+        if page is not None and done.page is not None:
+            from ..report import check_matplotlib, write_page
 
-        try:
-            check_matplotlib()
-            with working('drawing the page'):
-                write_page(page, done.page())
-            done = replace(done, stored=[*done.stored, page])
-        except (InputError, OSError) as err:  # beside a calibration, this is only noted
-            if not (args.command in _WITH_PAGE or done.stored):
-                raise
-            done = replace(done, shown=[*done.shown, f'no page {page}: {known_error(err)}'])
+            try:
+                check_matplotlib()
+                with working('drawing the page'):
+                    write_page(page, done.page())
+                done = replace(done, stored=[*done.stored, page])
+            except (InputError, OSError) as err:  # beside a calibration, this is only noted
+                if not (args.command in _WITH_PAGE or done.stored):
+                    raise
+                done = replace(done, shown=[*done.shown, f'no page {page}: {known_error(err)}'])
+    except (AccelCalibError, OSError) as err:
+        known, about = known_error(err), COMMANDS[args.command].about
+        return Done({**({'file': getattr(args, about)} if about else {}),
+                     'error': known.message, 'advice': known.advice,
+                     **({'read_as': known.read_as} if known.read_as else {})}, error=err)
     if done.rating is not None:
-        done = replace(done, result={**done.result, **rated(done.rating, args)})
+        step = done.rating.next
+        judged = rating_json(done.rating, step, next_command(step, args))
+        done = replace(done, result={**done.result, **judged})
     return done
 
 
 def _run_one(args: argparse.Namespace) -> int:
     """Run the command, and print the rating, then its findings and the notes, then the rest."""
-    command, output, target = COMMANDS[args.command], console(args), getattr(args, 'json', None)
-    try:
-        done = _done(args)
-    except (AccelCalibError, OSError) as err:
-        about = {'file': getattr(args, command.about)} if command.about else {}
-        error = _of_error(err)
-        write_json(target, {**about, **error})
-        if 'read_as' in error and target != STANDARD_OUTPUT:
-            output.print(f'read as: {error["read_as"]}')
-        raise
+    output, target, done = console(args), getattr(args, 'json', None), _carry_out(args)
     write_json(target, done.result)
-    rating, verbose = done.rating, getattr(args, 'verbose', True)
+    if done.error is not None:
+        if 'read_as' in done.result and target != STANDARD_OUTPUT:
+            output.print(f'read as: {done.result["read_as"]}')
+        raise done.error
+    rating, verbose, lines = done.rating, getattr(args, 'verbose', True), list[Any]()
+    if rating is not None:
+        first, *others = rating.lines
+        command = done.result['next']['command']
+        lines = [Verdict(first, rating.name), *others, *([f'      {command}'] if command else [])]
     findings = () if rating is None else rating.findings[rating.name != 'GOOD':]
     notes = [*(f'note: {each.words if verbose else each.text}' for each in findings), *done.notes]
     if not verbose and len(notes) > _MOST_NOTES:
         more = len(notes) - _MOST_NOTES + 1
         notes[_MOST_NOTES - 1:] = [f'{more} more lines with --verbose']
-    for each in (*(rating_lines(rating, args) if rating else ()), *notes, *done.shown,
-                 *(f'stored in {path}' for path in done.stored if str(path) != STANDARD_OUTPUT)):
+    for each in (*lines, *notes, *done.shown,
+                 *(f'stored in {path}' for path in done.stored if path != _PIPED)):
         output.print(each)
     if done.refusal:
         raise RefusedFitError(f'{args.output} is not written: {done.refusal[0]}', done.refusal[1])
@@ -188,49 +205,11 @@ def _run_one(args: argparse.Namespace) -> int:
 
 def _attempt(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """Return exit status and JSON for one of several inputs; an error is a result, too."""
-    try:
-        done = _done(args)
-    except (AccelCalibError, OSError) as err:
-        return BAD_INPUT, {'file': str(args.poses), **_of_error(err)}
+    done = _carry_out(args)
+    if done.error is not None:
+        return BAD_INPUT, {'file': str(args.poses), **plain(done.result)}
     refused = dict(zip(('error', 'advice'), done.refusal))
     return BAD_INPUT if refused else done.status, {**plain(done.result), **refused}
-
-
-def _of_error(error: AccelCalibError | OSError) -> dict[str, str]:
-    known = known_error(error)
-    read_as = {'read_as': known.read_as} if known.read_as else {}
-    return {'error': known.message, 'advice': known.advice, **read_as}
-
-
-def _in_parallel(function: Any, items: Sequence[Any], jobs: int) -> list[Any]:
-    """Return the results of a function for each item, in order; `jobs` processes are used."""
-    if jobs <= 1:
-        return [function(item) for item in items]
-    from concurrent.futures import ThreadPoolExecutor
-    from threading import local
-
-    from ..session import WorkerProcess
-
-    own, workers = local(), ExitStack()
-
-    def begin() -> None:
-        own.worker = workers.enter_context(closing(WorkerProcess(idle=False)))
-
-    with ThreadPoolExecutor(min(jobs, len(items)), initializer=begin) as pool, workers:
-        return list(pool.map(lambda item: own.worker.call(function, item), items))
-
-
-def rated(rating: Rating, args: argparse.Namespace) -> dict[str, Any]:
-    """Return a rating for JSON."""
-    step = rating.next
-    return rating_json(rating, step.kind, step.text, next_command(step, args))
-
-
-def rating_lines(rating: Rating, args: argparse.Namespace) -> list[str]:
-    """Return a rating as lines of text, the last one the next command if there is one."""
-    command = next_command(rating.next, args)
-    first, *others = rating.lines
-    return [Verdict(first, rating.name), *others, *([f'      {command}'] if command else [])]
 
 
 def write_json(target: str | None, result: object) -> None:
@@ -242,52 +221,28 @@ def write_json(target: str | None, result: object) -> None:
 
 def console(args: argparse.Namespace) -> Output:
     """Return the console for text output: standard error if a result goes to standard output."""
-    return Output(stderr=any(target.is_piped for target in _outputs(args)))
+    return Output(stderr=any(target.path == _PIPED for target in _outputs(args)))
 
 
 # ----------------------------------------------------------------------------- files to write
 
 def _outputs(args: argparse.Namespace) -> list[Target]:
-    """Return the outputs that are asked for."""
+    """Return the outputs that are asked for, and the page beside a calibration."""
     kinds = {'output': COMMANDS[args.command].writes, **_OUTPUTS}
     given = {name: getattr(args, name, None) for name in kinds}
-    return [Target(name, Path(path), kinds[name], '-o' if name == 'output' else f'--{name}')
-            for name, path in given.items() if path is not None]
+    found = [Target(name, Path(path), kinds[name], '-o' if name == 'output' else f'--{name}')
+             for name, path in given.items() if path is not None]
+    if args.command in _WITH_PAGE and found[0].path != _PIPED:
+        page = Target('page', args.output.parent / f'{args.output.stem}.html', 'page',
+                      'the page of -o')
+        found.insert(1, page)
+    return found
 
 
-def _for_each(args: argparse.Namespace) -> list[argparse.Namespace]:
-    """Return the arguments for each of one or several POSES; of several, outputs are folders."""
-    sources = getattr(args, 'poses', None)
-    if not isinstance(sources, list):
-        return [args]
-    folders = [target for target in _outputs(args)
-               if len(sources) > 1 and target.kind in _SUFFIXES]
-    return [argparse.Namespace(**{**vars(args), 'poses': source, **{
-        target.name: target.path / f'{Path(source).stem}{_SUFFIXES[target.kind]}'
-        for target in folders}}) for source in sources]
-
-
-def _targets(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -> Iterator[Target]:
-    """Yield the files that a command is to write."""
-    for target in _outputs(args):
-        if target.is_piped:
-            continue
-        if len(each) == 1 or target.kind not in _SUFFIXES:
-            yield target
-        elif target.path.is_dir():
-            for one in each:
-                yield target._replace(path=getattr(one, target.name),
-                                      option=f'{target.option} for {one.poses}')
-        else:
-            raise InputError(f'{target.option} {target.path} is not a folder, expected a folder '
-                             f'for {counted(len(each), "table")}', 'use an existing folder')
-        if args.command in _WITH_PAGE and target.name == 'output':
-            yield Target('page', target.path.with_suffix('.html'), 'page', 'the page of -o')
-
-
-def _check_targets(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -> None:
+def _check_targets(args: argparse.Namespace, outputs: Sequence[Target],
+                   each: Sequence[argparse.Namespace]) -> None:
     """Check that one result at most goes to standard output, and each file that is written."""
-    piped = [target.option for target in _outputs(args) if target.is_piped]
+    piped = [target.option for target in outputs if target.path == _PIPED]
     if len(piped) > 1:
         raise InputError(f'{" and ".join(piped)} are both -, expected one of them on standard '
                          'output', 'give one of them the name of a file')
@@ -299,15 +254,24 @@ def _check_targets(args: argparse.Namespace, each: Sequence[argparse.Namespace])
               if isinstance(path, Path)]
     inputs += [Path(text.removeprefix('@')) for text in getattr(args, 'recordings', ())]
     seen: dict[Path, str] = {}
-    for target in _targets(args, each):
-        if not target.kind and not target.path.exists():
-            continue
-        check_target(target, inputs, force=args.force)
-        whole = Path(os.path.realpath(target.path))
-        if whole in seen:
-            raise InputError(f'{seen[whole]} and {target.option} both name {target.path}, '
-                             'expected different files', 'choose another name')
-        seen[whole] = target.option
+    for target in outputs:
+        files = [] if target.path == _PIPED else [target]
+        if files and len(each) > 1 and target.kind in _SUFFIXES:
+            if not target.path.is_dir():
+                raise InputError(f'{target.option} {target.path} is not a folder, expected a '
+                                 f'folder for {counted(len(each), "table")}',
+                                 'use an existing folder')
+            files = [target._replace(path=getattr(one, target.name),
+                                     option=f'{target.option} for {one.poses}') for one in each]
+        for file in files:
+            if not file.kind and not file.path.exists():
+                continue
+            check_target(file, inputs, force=args.force)
+            whole = Path(os.path.realpath(file.path))
+            if whole in seen:
+                raise InputError(f'{seen[whole]} and {file.option} both name {file.path}, '
+                                 'expected different files', 'choose another name')
+            seen[whole] = file.option
 
 
 def check_target(target: Target, inputs: Iterable[Path], *, force: bool) -> None:
@@ -353,17 +317,13 @@ def log_options(args: argparse.Namespace, calibration: Calibration | None = None
         **given(LogOptions, args), 'columns': columns, 'context': named_topics(args.context)}))
 
 
-def settings(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the settings of the capture that are asked for."""
-    return given(CaptureSettings, args)
-
-
 @contextmanager
 def intake(args: argparse.Namespace, path: Path, calibration: Calibration | None = None
            ) -> Iterator[Intake]:
     """Yield the poses of a log, captured from a recording; later errors say how it was read."""
     with progress('samples') as moved:
-        found = poses_of(path, log_options(args, calibration), settings(args), moved)
+        found = poses_of(path, log_options(args, calibration),
+                         given(CaptureSettings, args), moved)
     with saying(found.said):
         yield found
 
@@ -383,11 +343,6 @@ def stored_calibration(path: Path, own: tuple[OwnEffect, ...]) -> Calibration:
         if found.kind in OF_FILE:
             Output(stderr=True).print(f'note: {path}: {found.words}')
     return calibration
-
-
-def prior(args: argparse.Namespace) -> FleetPrior | None:
-    """Return the typical values of ``--prior``."""
-    return None if args.prior is None else read_prior(args.prior, args.sensor_model)
 
 
 def rows_between(poses: Poses, text: str | None) -> slice:

@@ -11,7 +11,7 @@ first imports are few, because Ctrl-C ends the program without words only after 
 """
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import os
 import signal
 import sys
@@ -40,7 +40,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         use_one_thread()
         _open_streams()
         if '_ARGCOMPLETE' in os.environ:
-            _complete()
+            with suppress(ImportError):  # the shell then shows no completions
+                import argcomplete
+
+                argcomplete.autocomplete(parser())  # prints them, and exits
         if arguments is None:
             hide_warnings()
         given = sys.argv[1:] if arguments is None else list(arguments)
@@ -104,17 +107,6 @@ def _open_streams() -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, 'reconfigure'):
             stream.reconfigure(errors=plain_handler())
-
-
-def _complete() -> None:
-    """Print the completions that the shell asks for, and exit."""
-    try:
-        import argcomplete
-    except ImportError:
-        return  # the shell then shows no completions
-    from .commands import parser
-
-    argcomplete.autocomplete(parser())
 
 
 if __name__ == '__main__':

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 import math
 import signal
@@ -31,10 +31,11 @@ from rich.table import Table
 from rich.text import Text
 
 from .commands import HIDDEN
-from .frame import console, Done, FAILED, log_options, settings
+from .frame import console, Done, FAILED, given, log_options
 from .output import Output, table
 from ..errors import InputError, NEEDS_ROS
 from ..geometry import words_of
+from ..stillness import CaptureSettings
 from ..units import MG
 
 if TYPE_CHECKING:
@@ -86,7 +87,8 @@ def run_live(args: argparse.Namespace) -> Done:
             output.print(f'note: {each.words}')
         host = Host(source, CalibratorSettings(
             units=source.units.name, gravity=args.gravity, calibration_file=str(args.output),
-            web_host=args.host, web_port=args.port, also=str(args.also or ''), **settings(args)),
+            web_host=args.host, web_port=args.port, also=str(args.also or ''),
+            **given(CaptureSettings, args)),
             lambda line: output.print(line.words))
         try:
             print(host.server.announce(), flush=True)  # a file name is not wrapped
@@ -165,6 +167,9 @@ _CALLS = {'fit': 'CALL FIT', 'refine': 'CALL REFINE', 'level': 'SET LEVEL', 'acc
           'save': 'SAVE', 'done': 'DONE'}
 """Large words for each kind of step that is not a pose."""
 
+_SERVICE = 'ros2 service call {}/{} std_srvs/srv/Trigger'
+"""Call of a service of a node."""
+
 _SAME = math.cos(math.radians(10.0))
 """A direction within 10° of a side, an edge or a corner is named after it."""
 
@@ -205,7 +210,7 @@ def run_watch(args: argparse.Namespace) -> Done:
                              NEEDS_ROS) from err
         for_ros = [args.command, *args.for_ros]
         if not args.once:
-            with _output(args.bell) as show:
+            with _open_screen(args.bell) as show:
                 watch.watch(args.node, show, is_over, for_ros)
             return Done()
         node, progress = watch.current(args.node, is_over, for_ros)
@@ -217,33 +222,32 @@ def run_watch(args: argparse.Namespace) -> Done:
 
 
 @contextmanager
-def _output(bell: bool) -> Iterator[Show]:
-    """Yield the function that shows the progress."""
+def _open_screen(bell: bool) -> Iterator[Show]:
+    """Yield the function that shows the progress: on the screen, or by a line for each change."""
     console, before = Output(), ''
     last: Progress | None = None
     view: RenderableType | None = None
+    terminal: AbstractContextManager[Live | None] = nullcontext()
+    if sys.stdout.isatty() and not console.is_dumb_terminal:
+        terminal = Live(console=console, auto_refresh=False, screen=True)
+    with terminal as live:
+        def show(node: str, progress: Progress | None, problem: str) -> None:
+            nonlocal last, before, view
+            if live is not None:
+                if bell and progress is not None and last is not None and (
+                        progress.poses > last.poses):
+                    console.bell()
+                view = screen(node, progress, problem)
+                live.update(view, refresh=True)
+            else:
+                if problem != before:
+                    print(problem or f'messages from {node} arrive again', flush=True)
+                if progress is not None:
+                    for line in changes(node, last, progress):
+                        print(line, flush=True)
+            last, before = progress, problem
 
-    def print_changes(node: str, progress: Progress | None, problem: str) -> None:
-        nonlocal last, before
-        if problem != before:
-            print(problem or f'messages from {node} arrive again', flush=True)
-        if progress is not None:
-            for line in changes(node, last, progress):
-                print(line, flush=True)
-        last, before = progress, problem
-
-    def draw(node: str, progress: Progress | None, problem: str) -> None:
-        nonlocal last, view
-        if progress is not None and captured(last, progress) and bell:
-            console.bell()
-        last, view = progress, screen(node, progress, problem)
-        live.update(view, refresh=True)
-
-    if not sys.stdout.isatty() or console.is_dumb_terminal:
-        yield print_changes
-        return
-    with Live(console=console, auto_refresh=False, screen=True) as live:
-        yield draw
+        yield show
     if view is not None:
         console.print(view)  # the terminal returns to what it showed before
 
@@ -263,14 +267,11 @@ def screen(node: str, progress: Progress | None, problem: str = '') -> Renderabl
         rows.add_column(no_wrap=True, min_width=_WORDS)
         for row in _rows(progress):
             rows.add_row(Text(row.label), '' if math.isnan(row.share) else row, Text(row.words))
-        sides = _sides(progress)
+        sides, (advice, *others) = _sides(progress), _next_lines(node, progress)
         large = (_Large(_CALLS[progress.step], f'bold {GOOD}') if progress.step in _CALLS else
                  _Large(sides, NEXT) if sides else None)
         parts += [rows, '', *([large, ''] if large else ()),
-                  Text(progress.advice or 'wait', style='bold'),
-                  *([Text(_direction(progress), style='dim')] if sides else ()),
-                  *([Text(service_call(node, progress.command), style='dim')]
-                    if progress.command else ())]
+                  Text(advice, style='bold'), *(Text(each, style='dim') for each in others)]
     elif not problem:
         parts.append(Text('waiting for the first message'))
     return Panel(Group(*parts), title=Text(node), border_style=BAD if problem else 'dim')
@@ -280,33 +281,21 @@ def state(node: str, progress: Progress) -> Iterator[str]:
     """Yield the lines of a progress: its rows, the next step, and the call of its service."""
     for row in _rows(progress):
         yield f'{row.label}: {row.words}'
-    yield f'next: {progress.advice or "wait"}'
-    if _sides(progress):
-        yield _direction(progress)
-    if progress.command:
-        yield service_call(node, progress.command)
-
-
-def captured(before: Progress | None, now: Progress) -> bool:
-    """Return whether a pose was captured in between."""
-    return before is not None and now.poses > before.poses
+    advice, *others = _next_lines(node, progress)
+    yield from (f'next: {advice}', *others)
 
 
 def changes(node: str, before: Progress | None, now: Progress) -> Iterator[str]:
     """Yield a line for each change that the user must know; all is new if `before` is None."""
     if before is None or (before.poses, before.advice) != (now.poses, now.advice):
-        what = 'captured pose' if captured(before, now) else 'poses:'
+        what = 'captured pose' if before is not None and now.poses > before.poses else 'poses:'
+        words = {row.label: row.words for row in _rows(now)}
         command = '' if now.step == 'poses' else now.command  # a pose comes first
-        call = f': {service_call(node, command)}' if command else ''
-        yield (f'{what} {_count(now)}; coverage {now.coverage:.0%}; accuracy {_accuracy(now)}; '
-               f'next: {now.advice or "wait"}{call}')
+        call = f': {_SERVICE.format(node, command)}' if command else ''
+        yield (f'{what} {words["poses"]}; coverage {now.coverage:.0%}; accuracy '
+               f'{words["accuracy"]}; next: {now.advice or "wait"}{call}')
     if before is None or before.still != now.still:
         yield f'still: hold it for {now.min_dwell:g} s' if now.still else 'moving'
-
-
-def service_call(node: str, name: str) -> str:
-    """Return the command that calls a service of a node."""
-    return f'ros2 service call {node}/{name} std_srvs/srv/Trigger'
 
 
 def _rows(progress: Progress) -> list[_Row]:
@@ -318,34 +307,30 @@ def _rows(progress: Progress) -> list[_Row]:
     lengths = [f'{words}{each:.4f} g' for words, each in (
         ('', now.length), ('corrected ', now.corrected)) if not math.isnan(each)]
     share = now.poses / max(now.poses, now.total, 1)
+    count = f'{now.poses}' if now.poses >= now.total else f'{now.poses} of about {now.total}'
+    accuracy = (f'{now.accuracy * MG:.2g} mg expected' if math.isfinite(now.accuracy) else
+                'not known' if math.isnan(now.accuracy) else 'not determined by these poses')
     dwell = (f'{now.dwell:.1f} s of {now.min_dwell:g} s'
              f'{", long enough" if now.dwell >= now.min_dwell else ""}')
     return [
         _Row('stillness', stillness, now.stillness / _SCALE, style, 1.0 / _SCALE),
         _Row('dwell', dwell, now.dwell / now.min_dwell, style),
-        _Row('poses', _count(now), share),
+        _Row('poses', count, share),
         _Row('coverage', f'{now.coverage:.0%} of the sphere', now.coverage),
-        _Row('accuracy', _accuracy(now)), _Row('|a|', ', '.join(lengths) or 'not known'),
+        _Row('accuracy', accuracy), _Row('|a|', ', '.join(lengths) or 'not known'),
         *([] if math.isnan(now.temperature) else [
             _Row('temperature', f'{now.temperature:.1f} °C')])]
 
 
-def _count(progress: Progress) -> str:
-    if progress.poses >= progress.total:
-        return str(progress.poses)
-    return f'{progress.poses} of about {progress.total}'
-
-
-def _accuracy(progress: Progress) -> str:
-    if math.isnan(progress.accuracy):
-        return 'not known'
-    if math.isinf(progress.accuracy):
-        return 'not determined by these poses'
-    return f'{progress.accuracy * MG:.2g} mg expected'
-
-
-def _direction(progress: Progress) -> str:
-    return f'direction in sensor axes: {" ".join(f"{part:+.2f}" for part in progress.direction)}'
+def _next_lines(node: str, progress: Progress) -> list[str]:
+    """Return the next step, its direction if that has a name, and the call of its service."""
+    lines = [progress.advice or 'wait']
+    if _sides(progress):
+        parts = ' '.join(f'{part:+.2f}' for part in progress.direction)
+        lines.append(f'direction in sensor axes: {parts}')
+    if progress.command:
+        lines.append(_SERVICE.format(node, progress.command))
+    return lines
 
 
 def _sides(progress: Progress) -> str:

@@ -14,7 +14,7 @@ does not wait for numpy.
 
 import argparse
 import codecs
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from difflib import get_close_matches
 from functools import cache, partial
 from importlib import import_module
@@ -153,11 +153,7 @@ def option(*names: str, **about: Any) -> Option:
 
 def late(module: str, name: str) -> partial[Any]:
     """Return a name of another module of the package, to be imported when an option is added."""
-    def named() -> Any:
-        found = getattr(import_module(f'..{module}', __package__), name)
-        return tuple(found) if isinstance(found, Mapping) else found
-
-    return partial(named)
+    return partial(lambda: getattr(import_module(f'..{module}', __package__), name))
 
 
 def add_options(made: Parser, options: Options) -> None:

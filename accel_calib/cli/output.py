@@ -18,7 +18,7 @@ from contextlib import contextmanager
 import re
 import sys
 from textwrap import wrap
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich import box
 from rich.console import Console
@@ -30,8 +30,6 @@ from ..logs import Progress
 from ..text import short
 
 _NO_BREAK = '\N{NO-BREAK SPACE}'
-_MARK = '\ue000'
-"""Stands for a letter of the rating while a line is broken."""
 
 _COLOURS = {'GOOD': 'bold green', 'USABLE': 'bold yellow', 'BAD': 'bold red'}
 
@@ -39,17 +37,12 @@ _TIED = r'(?<=±) | (?=±)|(?<==) | (?==)|(?<=\d) (?=(mg|g|s|h|Hz|%|°|°C|m/s²
 """Spaces at which a line does not break: ``value ± sd``, ``p = 0.1``, ``3 mg``."""
 
 
-class Verdict(str):
+class Verdict(NamedTuple):
     """A line of text with a rating from a character on, which a terminal shows in colour."""
 
+    line: str
     rating: str
-    start: int
-
-    def __new__(cls, line: str, rating: str, start: int = 0) -> Verdict:
-        """Return the line with these attributes."""
-        made = super().__new__(cls, line)
-        made.rating, made.start = rating, start
-        return made
+    start: int = 0
 
 
 class Output(Console):
@@ -64,24 +57,23 @@ class Output(Console):
 
     def print(self, *objects: Any, **options: Any) -> None:  # noqa: A003
         """Print; lines of text break at words, and the rest of a line is indented."""
-        if len(objects) != 1 or not isinstance(line := objects[0], str):
+        if len(objects) != 1 or not isinstance(given := objects[0], str | Verdict):
             super().print(*objects, **options)
             return
-        if isinstance(line, Verdict):
-            end, mark = line.start + len(line.rating), _MARK * len(line.rating)
-            before, _, after = self._broken(
-                f'{line[:line.start]}{mark}{line[end:]}').partition(mark)
-            text = Text.assemble(self.render_str(before), (line.rating, _COLOURS[line.rating]),
-                                 self.render_str(after))
-        else:
-            text = self.render_str('\n'.join(map(self._broken, line.split('\n'))))
+        line, rating, start = given if isinstance(given, Verdict) else (given, '', 0)
+        text = self._break_lines(line)
+        if rating:
+            end = len(self._break_lines(line[:start + len(rating)]))
+            text.stylize(_COLOURS[rating], end - len(rating), end)
         super().print(text, soft_wrap=True, **options)
 
-    def _broken(self, line: str) -> str:
-        tied = re.sub(_TIED, _NO_BREAK, line)
-        parts = wrap(tied, self.width, subsequent_indent='  ', break_long_words=False,
-                     break_on_hyphens=False)
-        return '\n'.join(parts).replace(_NO_BREAK, ' ') or line
+    def _break_lines(self, text: str) -> Text:
+        lines = []
+        for line in text.split('\n'):
+            parts = wrap(re.sub(_TIED, _NO_BREAK, line), self.width, subsequent_indent='  ',
+                         break_long_words=False, break_on_hyphens=False)
+            lines.append('\n'.join(parts).replace(_NO_BREAK, ' ') or line)
+        return self.render_str('\n'.join(lines))
 
 
 def shown(text: str, encoding: str) -> str:
@@ -105,11 +97,6 @@ def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], **s
     for row in rows:
         made.add_row(*row)
     return made
-
-
-def error_line(result: dict[str, Any]) -> str:
-    """Return the error of one of several inputs; empty if there is none."""
-    return f'{result["error"]}; {result["advice"]}' if 'error' in result else ''
 
 
 def short_if_known(value: float | None) -> str:

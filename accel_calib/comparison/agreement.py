@@ -54,7 +54,7 @@ import numpy as np
 import scipy
 
 from ..calibration import Calibration, fit_unknown, in_g, NORM_MODELS
-from ..effects import add_history, Context, Model, reading_of
+from ..effects import add_history, Context, Model, predict
 from ..errors import InputError, RefusedFitError
 from ..estimate import judge, scatter_of
 from ..table import Floats
@@ -109,7 +109,7 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
     """
     model = calibration.model
     origin = np.zeros((1, 3))
-    vec_v = reading_of(model, origin, context)[0]
+    vec_v = predict(model, origin, context)[0]
     mat_w = model.at(context).slope(origin)[0]
     slope_v = model.basis(origin, context).full[0]
     here = {key: np.repeat(column, 3, 0) for key, column in context.items()}

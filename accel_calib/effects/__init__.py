@@ -37,14 +37,13 @@ from .catalogue import (
     NOMINAL_SUPPLY, OFFSET_POWERS, parameter_names, ParameterName, PROCESSES,
     REFERENCE_TEMPERATURE, WANDER)
 from .form import (
-    AFFINE, AXES, by_axis, Context, CUBE, difference, Effect, EffectKey, EffectRecord,
-    fitted_places, FORCE, MODES, MONOMIALS, ODD_SQUARE, ONE, PRODUCT, SIZE, SQUARE, TO_SEPARATE,
-    WAVE, ZONAL, ZONES)
+    AFFINE, AXES, by_axis, Context, CUBE, Effect, EffectKey, EffectRecord, fitted_places, FORCE,
+    MONOMIALS, ODD_SQUARE, ONE, PRODUCT, SIZE, SQUARE, TO_SEPARATE, WAVE, ZONAL, ZONES)
 from .formula import formula_of
 from .model import (
     AtContext, check_context, CONVERGED_G, correct, EachShape, factors_of, LARGEST_FORCE_G,
-    LARGEST_ITERATIONS, length_rows, linear_model, Model, own_slope, predict, reading_of,
-    sensor_force, times, too_large, with_vector)
+    LARGEST_ITERATIONS, length_rows, linear_model, Model, own_slope, predict, sensor_force, times,
+    too_large, with_vector)
 from .own import effects_of_file, own_effects, OwnEffect
 from .records import (
     CARRIERS, Covariate, covariates_of, curves_over, effect_named, EMPIRICAL, EmpiricalCurve,
@@ -56,17 +55,16 @@ from .way import add_acting, add_history, context_of_samples, FROM_TEMPERATURE, 
 
 __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CATALOGUE', 'CHANGES', 'CONVERGED_G', 'CUBE', 'EFFECTS',
            'EMPIRICAL', 'FORCE', 'FROM_TEMPERATURE', 'LADDER', 'LARGEST_FORCE_G',
-           'LARGEST_ITERATIONS', 'MODELS', 'MODES', 'MONOMIALS', 'NOMINAL_SUPPLY', 'ODD_SQUARE',
+           'LARGEST_ITERATIONS', 'MODELS', 'MONOMIALS', 'NOMINAL_SUPPLY', 'ODD_SQUARE',
            'OFFSET_POWERS', 'ONE', 'PROCESSES', 'PRODUCT', 'REFERENCE_TEMPERATURE', 'SIZE',
            'SQUARE', 'TO_SEPARATE', 'VARIABLES', 'WANDER', 'WAVE', 'ZONAL', 'ZONES', 'AtContext',
            'Context', 'Covariate', 'EachShape', 'Effect', 'EffectKey', 'EffectRecord',
            'EmpiricalCurve', 'Model', 'ModelForm', 'OwnEffect', 'ParameterName', 'ThermalStream',
            'acting_temperature', 'add_acting', 'add_history', 'between_steps', 'by_axis',
            'check_context', 'context_of_samples', 'correct', 'covariates_of', 'curves_over',
-           'difference', 'effect_named', 'effects_of_file', 'entry_of', 'factors_of',
-           'fitted_places', 'formula_of', 'included', 'kind_of', 'length_rows', 'linear_model',
-           'linear_values', 'model_with', 'modes_of', 'own_effects', 'own_slope',
-           'parameter_names', 'parse_effect', 'predict', 'products_of', 'rate_at', 'reading_of',
-           'sensor_force', 'shown_name', 'simulate_poses', 'simulate_recording', 'thermal_stream',
-           'times', 'too_large', 'turn_between', 'unchanged', 'unit_of', 'value_unit',
-           'variable_of', 'variable_words', 'with_vector']
+           'effect_named', 'effects_of_file', 'entry_of', 'factors_of', 'fitted_places',
+           'formula_of', 'included', 'kind_of', 'length_rows', 'linear_model', 'linear_values',
+           'model_with', 'modes_of', 'own_effects', 'own_slope', 'parameter_names', 'parse_effect',
+           'predict', 'products_of', 'rate_at', 'sensor_force', 'shown_name', 'simulate_poses',
+           'simulate_recording', 'thermal_stream', 'times', 'too_large', 'turn_between',
+           'unchanged', 'unit_of', 'value_unit', 'variable_of', 'variable_words', 'with_vector']

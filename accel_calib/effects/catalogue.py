@@ -7,6 +7,7 @@ from collections import ChainMap
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -66,6 +67,9 @@ def _instants(context: Context) -> Iterator[Floats]:
         yield np.array([instant])
 
 
+_MEMORIES = (0.25, 0.5, 0.75, 1.0)
+"""Parts of a hysteresis that the turn before the last one leaves, to try."""
+
 _LAGS = 20
 """Number of lags to try for each kind of lag."""
 
@@ -101,9 +105,24 @@ def _lagged_warming(key: str) -> Factor:
 
 
 def _motion(context: Mapping[str, Any], shape: Floats) -> Floats:
-    """Return the unit vector towards the previous pose, or in form 1 its sign by axis."""
-    towards: Floats = np.asarray(context['previous'], float).T
-    return np.sign(towards) if shape[0] else towards
+    """
+    Return the unit vector towards the previous pose, or in form 1 its sign by axis.
+
+    Beside it counts what the turn before it leaves: `memory` times its vector or sign.
+
+    """
+    form, memory = shape
+    towards, earlier = (np.asarray(context[key], float).T if key in context else 0.0
+                        for key in ('previous', 'earlier'))
+    last, one_before = (np.sign(way) if form else way for way in (towards, earlier))
+    return np.asarray(last + memory * one_before)
+
+
+def _motions(context: Context) -> Iterator[Floats]:
+    """Yield the forms without memory, then with memories if two turns lead to a pose."""
+    yield from np.array([[0.0, 0.0], [1.0, 0.0]])
+    if np.any(context.get('earlier', 0.0)):
+        yield from np.array([*product((0.0, 1.0), _MEMORIES)])
 
 
 def _creep(context: Mapping[str, Any], shape: Floats) -> Floats:
@@ -230,8 +249,8 @@ EFFECTS: dict[str, Effect] = {
         factor=lambda context, shape: np.asarray(context['std'], float).T ** 2),
     'hysteresis': _effect(
         'offset that depends on the previous pose', 'hysteresis', AXES, 'g', 0.001,
-        terms=by_axis(ONE), factor=_motion, needs=('previous',), shape=('form',),
-        shapes=lambda context: iter(np.array([[0.0], [1.0]])), usual=(0.0,)),
+        terms=by_axis(ONE), factor=_motion, needs=('previous',), shape=('form', 'memory'),
+        shapes=_motions, usual=(0.0, 0.0)),
     'creep': _effect(
         'offset that relaxes after a turn', 'creep', AXES, 'g', 0.001, terms=by_axis(ONE),
         factor=_creep, needs=('time', 'previous'), shape=('tau',), shapes=_relaxations,

@@ -51,13 +51,6 @@ MODES = 24
 """Number of cosines that an empirical curve can have."""
 
 
-def _wave(mode: int) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """Return the cosine of a mode over -1 to 1 g, and its slope."""
-    turn = mode * np.pi / 2.0
-    return (lambda u: np.cos(turn * (np.clip(u, -1.0, 1.0) + 1.0)),
-            lambda u: -turn * np.sin(turn * (np.clip(u, -1.0, 1.0) + 1.0)) * (abs(u) < 1.0))
-
-
 DEGREES = (3, 4, 5, 6)
 """Degrees of the spherical harmonics of which a gain that depends on the direction consists. Those
 of lower degree are offsets, gains and cross-axis gains."""
@@ -102,9 +95,6 @@ class Zone(NamedTuple):
             size = (x * x + y * y + z * z + 1e-300) ** 0.5
             return (a * x + b * y + d * z) / size, size
 
-        def value(axis: int, *u: Any) -> Any:
-            return u[axis] * _horner(self.polynomial, cosine(*u)[0])
-
         def gradient(axis: int, *u: Any) -> tuple[Any, Any, Any]:
             c, size = cosine(*u)
             steep = u[axis] / size * _horner(slope, c)
@@ -113,7 +103,8 @@ class Zone(NamedTuple):
                        for k, (towards, part) in enumerate(zip(self.towards, u)))
             return x, y, z
 
-        return [Monomial(partial(value, axis), partial(gradient, axis)) for axis in range(3)]
+        return [Monomial(lambda *u, axis=axis: u[axis] * _horner(self.polynomial, cosine(*u)[0]),
+                         partial(gradient, axis)) for axis in range(3)]
 
 
 ZONES = [Zone(degree, towards, leg2poly([0.0] * degree + [1.0]).tolist())
@@ -130,7 +121,11 @@ MONOMIALS: tuple[Monomial, ...] = (
     Monomial(lambda x, y, z: x * y, lambda x, y, z: (y, x, 0.0)),
     Monomial(lambda x, y, z: x * z, lambda x, y, z: (z, 0.0, x)),
     Monomial(lambda x, y, z: y * z, lambda x, y, z: (0.0, z, y)),
-    *(monomial for mode in range(1, MODES + 1) for monomial in each_axis(*_wave(mode))),
+    *(monomial for turn in (np.pi / 2.0 * np.arange(1, MODES + 1)).tolist()
+      for monomial in each_axis(
+          lambda u, turn=turn: np.cos(turn * (np.clip(u, -1.0, 1.0) + 1.0)),
+          lambda u, turn=turn: -turn * np.sin(
+              turn * (np.clip(u, -1.0, 1.0) + 1.0)) * (abs(u) < 1.0))),
     *(monomial for zone in ZONES for monomial in zone.monomials()),
 )
 """1; u_i; u_i²; u_i³; u_i|u_i|; |u_i|; u_x u_y, u_x u_z, u_y u_z; cos(k π (u_i + 1) / 2) for each
@@ -272,9 +267,10 @@ class Effect:
         return values[:len(self.parameters)], values[len(self.parameters):]
 
     def filled(self, values: Floats) -> Floats:
-        """Return (p,) or (p + s,) values as (p + s,), with the usual shape where none is given."""
-        if self.usual and np.shape(values) == (len(self.parameters),):
-            return np.concatenate([values, self.usual])
+        """Return (p,) to (p + s,) values as (p + s,), with the usual shape where none is given."""
+        missing = len(self.values) - len(values)
+        if self.usual and 0 < missing <= len(self.shape):
+            return np.concatenate([values, self.usual[-missing:]])
         return values
 
     def shown(self, values: Floats) -> dict[str, float]:
@@ -302,11 +298,6 @@ class EffectRecord(ABC):
 
     @property
     @abstractmethod
-    def kind(self) -> str:
-        """Return the name of the effect without what it is a function of."""
-
-    @property
-    @abstractmethod
     def entry(self) -> Effect:
         """Return the effect as the catalogue has them."""
 
@@ -317,7 +308,7 @@ EffectKey = str | EffectRecord
 AT_POSES = ('since_turn', 'duration')
 """Columns that only poses have."""
 
-_FITTED_SHAPES = ('tau', 'lag')
+_FITTED_SHAPES = ('tau', 'lag', 'memory')
 """Shape constants of the catalogue that a fit changes; the others are found once."""
 
 _SHAPE_STEP = 1e-4

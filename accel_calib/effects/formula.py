@@ -58,25 +58,24 @@ def formula_of(effect: EffectKey, values: Floats, deviations: Mapping[str, float
     curves = factors @ waves
     noise = np.sqrt(np.mean(sizes ** 2 @ waves ** 2, axis=1))
     most = np.maximum(_EXACT * np.max(np.ptp(curves, axis=1)), 0.5 * noise) + 1e-12
-    expression: _Expression = partial(_of_waves, modes, high - low)
-    for group in _forms(share, high - low):
+    for group in _forms(share, high - low, modes):
         fits = [np.linalg.lstsq(functions.T, curves.T, rcond=None)[0].T for functions, _ in group]
         errors = [np.max(rms_of_rows(fit @ functions - curves) / most)
                   for fit, (functions, _) in zip(fits, group, strict=True)]
         best = int(np.argmin(errors))
         if errors[best] <= 1.0:
-            factors, expression = fits[best], group[best][1]
             break
+    expression = group[best][1]
     unit = 'g' if variable == 'force' else unit_of(variable)
     each = ', '.join(f'{own} = {expression(row)}'
-                     for own, row in zip(names, factors.tolist(), strict=True))
+                     for own, row in zip(names, fits[best].tolist(), strict=True))
     return (f'{effect.carrier.replace("_", "-")} [m{effect.unit}]: {each}; t = '
             f'{variable_words(variable)}{f" {_signed(-low)}" if low else ""}, from 0 to '
             f'{high - low:.6g} {unit}').rstrip()
 
 
-def _forms(share: Floats, span: float) -> Iterator[list[_Form]]:
-    """Yield groups of forms with the same number of constants, over shares of a span."""
+def _forms(share: Floats, span: float, modes: Sequence[int]) -> Iterator[list[_Form]]:
+    """Yield groups of forms over shares of a span; at last the cosines of the modes."""
     one = np.ones_like(share)
     yield [_polynomial(share, 1, span)]
     yield [_polynomial(share, 2, span),
@@ -92,6 +91,8 @@ def _forms(share: Floats, span: float) -> Iterator[list[_Form]]:
              for rate, angle in angles)]
     for degree in (4, 5, 6):
         yield [_polynomial(share, degree, span)]
+    yield [(np.cos(np.pi * np.multiply.outer(np.array(modes), share)), lambda row: ' '.join(
+        f'{_signed(value)}*cos({np.pi * mode / span:.6g}*t)' for mode, value in zip(modes, row)))]
 
 
 def _polynomial(share: Floats, degree: int, span: float) -> _Form:
@@ -111,11 +112,6 @@ def _one_term(term: str, row: Sequence[float]) -> str:
 def _sine(rate: float, row: Sequence[float]) -> str:
     size, angle = float(np.hypot(row[1], row[2])), float(np.arctan2(row[2], row[1]))
     return f'{row[0]:.5g} {_signed(size)}*sin({rate:.5g}*t {_signed(angle)})'
-
-
-def _of_waves(modes: Sequence[int], span: float, row: Sequence[float]) -> str:
-    return ' '.join(f'{_signed(value)}*cos({np.pi * mode / span:.6g}*t)'
-                    for mode, value in zip(modes, row, strict=True))
 
 
 def _signed(value: float) -> str:

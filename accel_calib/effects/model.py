@@ -557,12 +557,7 @@ def predict(model: Model, force: Floats, context: Context) -> Floats:
     the effects need, n rows each. Raise `InputError` if a column is missing.
 
     """
-    return reading_of(model, force @ model.rotation.T, context)
-
-
-def reading_of(model: Model, u: Floats, context: Context) -> Floats:
-    """Return the (n, 3) readings for the (n, 3) force u in the sensor axes [g]."""
-    reading = model.at(context).reading(u)
+    reading = model.at(context).reading(force @ model.rotation.T)
     for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
         if effect.output is not None:
             reading = effect.output(reading, values)

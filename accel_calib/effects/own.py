@@ -129,8 +129,9 @@ class OwnEffect(EffectRecord):
         self._check(self.function is None or len(self._columns) > 0,
                     'has a function without a column, expected an argument such as temperature')
         self._check(len(self.constants) <= len(_STEPS) + 1, 'has too many constants, expected 4')
+        arguments = {name for _, _, names in self._calls for name in names}
         for name, numbers in self.constants.items():
-            self._check(name in self._arguments and name not in taken, 'has a constant '
+            self._check(name in arguments and name not in taken, 'has a constant '
                         f'{name!r}, expected an argument of its function that is no column')
             self._check(len(numbers) > 1 and -np.inf < numbers[0] < numbers[1] < np.inf
                         and all(numbers[0] <= start <= numbers[1] for start in numbers[2:]),
@@ -153,10 +154,6 @@ class OwnEffect(EffectRecord):
             raise InputError(f'the effect {self.name!r} {else_}', 'correct its definition')
 
     def __str__(self) -> str:
-        return self.name
-
-    @property
-    def kind(self) -> str:
         return self.name
 
     @property
@@ -191,25 +188,18 @@ class OwnEffect(EffectRecord):
         return (('function', self.function, names),)
 
     @cached_property
-    def _arguments(self) -> tuple[str, ...]:
-        return tuple(name for _, _, names in self._calls for name in names)
-
-    @cached_property
     def _columns(self) -> tuple[str, ...]:
-        return tuple(name for name in self._arguments if name not in self.constants)
-
-    @cached_property
-    def _places(self) -> list[int]:
-        return [k for k, axis in enumerate(AXES) if axis in self.axes or self.axes == _ALL]
+        return tuple(name for _, _, names in self._calls for name in names
+                     if name not in self.constants)
 
     @cached_property
     def entry(self) -> Effect:
         over = tuple(key for key in self._columns if key != 'force')
+        axes = [k for k, axis in enumerate(AXES) if axis in self.axes or self.axes == _ALL]
         return Effect(
             words=self.words, term='own effect', unit=self.unit, typical=self.typical,
             parameters=(_ALL,) if self.axes == _ALL else tuple(self.axes), plausible_g=0.5,
-            terms=tuple(Term(k * (self.axes != _ALL), axis, ONE)
-                        for k, axis in enumerate(self._places)),
+            terms=tuple(Term(k * (self.axes != _ALL), axis, ONE) for k, axis in enumerate(axes)),
             factor=self._factor if self._columns else None, over=over,
             needs=tuple(dict.fromkeys(need for key in over for need in _NEEDS.get(key, (key,)))),
             shape=tuple(self.constants), shapes=self._shapes if self.constants else None,
@@ -240,7 +230,8 @@ class OwnEffect(EffectRecord):
         found = np.ones((1, 1))
         for what, function, names in self._calls:
             found = found * self._guarded(what, function, [known[name] for name in names])
-        factor = found[:, 0] if found.shape[1] == 1 else found.T[self._places]
+        factor = found[:, 0] if found.shape[1] == 1 else found.T[[
+            term.axis for term in self.entry.terms]]
         return factor[..., 0] if one else factor
 
     def _guarded(self, what: str, function: Callable[..., Any], given: Sequence[Any]) -> Floats:

@@ -64,10 +64,6 @@ class EmpiricalCurve(EffectRecord):
     part: str = ''
 
     @property
-    def kind(self) -> str:
-        return EMPIRICAL
-
-    @property
     def changed(self) -> str:
         """Return the carrier with its part, such as ``gain.z``."""
         return f'{self.carrier}.{self.part}' if self.part else self.carrier
@@ -104,16 +100,12 @@ class Covariate(EffectRecord):
     power: int = 1
 
     @property
-    def kind(self) -> str:
-        return f'{self.part}_covariate'
-
-    @property
     def variable(self) -> str:
         """Return the column, or both, such as ``humidity*pressure``."""
         return '*'.join(self.columns)
 
     def __str__(self) -> str:
-        return f'{self.kind}-{self.variable}{"-2" if self.power == 2 else ""}'
+        return f'{self.part}_covariate-{self.variable}{"-2" if self.power == 2 else ""}'
 
     @property
     def entry(self) -> Effect:
@@ -151,7 +143,7 @@ def effect_named(text: str, own: Iterable[EffectRecord] = ()) -> EffectKey:
 
 def kind_of(effect: EffectKey) -> str:
     """Return the name of an effect without what it is a function of."""
-    return effect if isinstance(effect, str) else effect.kind
+    return str(effect).partition('-')[0]
 
 
 def unchanged(effect: EffectKey) -> EffectKey:

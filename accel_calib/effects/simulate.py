@@ -56,7 +56,8 @@ def _values_of(name: EffectKey, given: ArrayLike, own: Sequence[EffectRecord], t
     effect = entry_of(key)
     values, names = np.atleast_1d(np.asarray(given, float)), effect.values
     least = len(effect.parameters) if effect.usual else len(names)
-    counts = sorted({least, len(names), 1 if least == len(effect.parameters) else least})
+    counts = sorted({*range(least, len(names) + 1),
+                     1 if least == len(effect.parameters) else least})
     if not np.all(np.isfinite(values)) or values.shape not in [(count,) for count in counts]:
         count = ' or '.join(map(str, counts))
         raise InputError(f'effect {name} has values {text or values.tolist()}, expected {count} '
@@ -158,7 +159,7 @@ def simulate_recording(model: Model, directions: Floats, rng: np.random.Generato
     way = way_to((directions @ model.rotation.T)[np.newaxis], {})
     known = {'std': np.full((count, 3), noise_g), 'previous': way[place], **columns,
              'since_turn': columns['time'] - columns['time'][np.searchsorted(place, place)]}
-    reading = predict(model, force, known)
+    reading = predict(model, force, add_turns(known))
     columns['reading'] = reading + rng.normal(size=(count, 3)) * noise_g
     columns['rate'] = rate @ model.rotation.T + rng.normal(size=(count, 3)) * gyro_noise
     return Recording(columns, numbered(columns))

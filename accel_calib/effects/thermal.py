@@ -33,6 +33,7 @@ Times need not be sorted. A row without time or temperature is NaN, and the othe
 
 """
 
+from array import array
 from collections.abc import Mapping
 import math
 from typing import Any, NamedTuple
@@ -68,7 +69,7 @@ _LEAST_MOMENTS = 5
 _LEAST_LEVELS = 4
 """Smallest number of temperatures that occur more than once, by which steps are known."""
 
-_COARSEST = 0.51
+_COARSEST = 1.01
 """Largest step of a thermometer [°C]: larger ones may be exact temperatures that were set."""
 
 _REPEATED = 0.5
@@ -209,43 +210,38 @@ def _motion(step: Floats) -> tuple[Floats, Floats]:
     return np.moveaxis(moved, 2, 0), np.moveaxis(spread, 2, 0)
 
 
-def low_passed(time: Floats, temperature: Floats, lag: float, rate: Floats | None = None
-               ) -> Floats:
+def low_passed(time: Floats, temperature: Floats, lag: float, rate: Floats) -> Floats:
     """
     Return the (n,) low pass of a temperature [°C], which starts in equilibrium.
 
-    With `rate` [°C/s] the temperature is cubic between the times, otherwise linear; at equal times
-    it jumps. NaN where an input is NaN.
+    With the `rate` [°C/s] the temperature is cubic between the times; at equal times it jumps. NaN
+    where an input is NaN.
 
     """
     found = np.full(len(time), np.nan)
     order = np.argsort(time, kind='stable')
     order = order[np.isfinite(time[order]) & np.isfinite(temperature[order])]
-    if len(order):
-        time, temperature = time[order], temperature[order]
-        behind = _behind(np.diff(time), np.diff(temperature), lag,
-                         None if rate is None else rate[order])
-        found[order] = temperature - _decayed(time, behind, lag, 0.0)
-    return found
-
-
-def _behind(step: Floats, rise: Floats, lag: float, rate: Floats | None) -> Floats:
-    """Return how far the low pass falls behind over each step if it starts in equilibrium."""
-    steps = step / lag
-    share = np.ones_like(steps)
-    np.divide(-np.expm1(-steps), steps, out=share, where=steps > 0.0)
-    behind: Floats = rise * share
-    if rate is None:
-        return behind
+    if not len(order):
+        return found
+    step, rise, rate = np.diff(time[order]), np.diff(temperature[order]), rate[order]
+    usable = step > 0.0
     # Cubic Hermite: the rate is the mean rate plus a(1 - 2s) + b(1 - 6s + 6s²), s from 0 to 1,
     # and ∫ rate exp(-(1 - s) x) ds over the step with moments M_k = ∫ s^k exp(-(1 - s) x) ds.
-    usable = step > 0.0
     mean = np.divide(rise, step, out=np.zeros_like(rise), where=usable)
     first, last = np.nan_to_num(rate[:-1]), np.nan_to_num(rate[1:])
     odd, even = (first - last) / 2.0, (first + last) / 2.0 - mean
-    m_0, m_1, m_2 = _moments(steps)
+    m_0, m_1, m_2 = _moments(step / lag)
     bent = odd * (m_0 - 2.0 * m_1) + even * (m_0 - 6.0 * m_1 + 6.0 * m_2)
-    return behind + np.where(usable, step * bent, 0.0)
+    # T - A: zero at the start, then its decay plus how far A falls behind over each step. After
+    # pass k each sum has its last 2^k steps, and `kept` what remains of what is older.
+    behind = np.append(0.0, rise * m_0 + np.where(usable, step * bent, 0.0))
+    kept, reach = np.exp(-np.diff(time[order], prepend=-np.inf) / lag), 1
+    while reach < len(behind) and np.any(kept):
+        behind[reach:] += kept[reach:] * behind[:-reach]
+        kept[reach:] *= kept[:-reach]
+        reach *= 2
+    found[order] = temperature[order] - behind
+    return found
 
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -265,53 +261,31 @@ def _moments(steps: Floats) -> Floats:
     return np.where(steps <= _SMALL, near, [m_0, m_1, m_2])
 
 
-def _decayed(time: Floats, behind: Floats, lag: float, start: float) -> Floats:
-    """
-    Return T - A at n increasing times: `start`, then its decay plus the n - 1 steps behind.
-
-    After pass k each sum has its last 2^k steps, and `kept` what remains of what is older.
-
-    """
-    found, kept = np.append(start, behind), np.exp(-np.diff(time, prepend=-np.inf) / lag)
-    reach = 1
-    while reach < len(found) and np.any(kept):
-        found[reach:] += kept[reach:] * found[:-reach]
-        kept[reach:] *= kept[:-reach]
-        reach *= 2
-    return found
-
-
 class _RateFilter:
     """Kalman filter of temperature, rate and bend (°C/s²) from averages of past samples."""
 
     def __init__(self, time: float, temperature: float) -> None:
-        self._time = time
-        self._state = np.array([temperature, 0.0, 0.0])
+        self.time = time
+        self.state = np.array([temperature, 0.0, 0.0])
         self._spread = np.diag(np.square([_ERROR, _START_RATE, _START_BEND]))
 
     def add(self, time: float, temperature: float) -> None:
-        moved, added = (each[0] for each in _motion(np.array([time - self._time])))
-        state = moved @ self._state
+        moved, added = (each[0] for each in _motion(np.array([time - self.time])))
+        state = moved @ self.state
         spread = moved @ self._spread @ moved.T + added
         gain = spread[:, 0] / (spread[0, 0] + _ERROR ** 2)
-        self._state = state + gain * (temperature - state[0])
+        self.state = state + gain * (temperature - state[0])
         self._spread = spread - np.outer(gain, spread[0])
-        self._time = time
-
-    def line(self, start: float) -> tuple[float, float]:
-        """Return rate [°C/s] and bend [°C/s²] at a time."""
-        _, rate, bend = self._state.tolist()
-        return rate + bend * (start - self._time), bend
+        self.time = time
 
 
 class ThermalStream:
     """
     Lag and rate of the temperature of a stream, from each sample and earlier ones.
 
-    `add_all` gives the same numbers as `add`, also if a stream is added in several parts. `lags`
-    are by column of the temperature that acts (`accel_calib.effects.Model.lags`). With `rate`, the
-    column ``temperature_rate`` is computed. `value` has the columns at the last sample with a
-    temperature; it is empty before it.
+    `lags` are by column of the temperature that acts (`accel_calib.effects.Model.lags`). With
+    `rate`, the column ``temperature_rate`` is computed. `value` has the columns at the last sample
+    with a temperature; it is empty before it.
 
     """
 
@@ -320,40 +294,36 @@ class ThermalStream:
         self._gives_rate = rate
         self._uses_rate = rate or any(lag.of_sensor for lag in lags.values())
         self.value: dict[str, float] = {}
-        self._last: tuple[float, float] | None = None
-        self._restart(math.nan)
-
-    def _restart(self, time: float) -> None:
-        self._behind = dict.fromkeys(self._lags, 0.0)
-        self._filter: _RateFilter | None = None
-        self._begin, self._count, self._times, self._sum = time, 0, 0.0, 0.0
-        self._line = (0.0, 0.0)
-
-    def _before(self, time: float, temperature: float) -> tuple[float, float]:
-        """Return the sample before this one: itself if the stream starts, or starts again."""
-        if self._last is None or time < self._last[0] - _RESTART:
-            self._restart(time)
-            return time, temperature
-        return self._last
+        self._last = (math.nan, math.nan)
 
     def add(self, time: float, temperature: float) -> None:
         """Add a sample; it is ignored if its time or temperature is NaN."""
         if not math.isfinite(time + temperature):
             return
-        before, warm = self._before(time, temperature)
+        if not time >= self._last[0] - _RESTART:  # the first sample, too
+            self._last = time, temperature
+            self._behind = dict.fromkeys(self._lags, 0.0)
+            self._filter: _RateFilter | None = None
+            self._begin, self._count, self._times, self._sum = time, 0, 0.0, 0.0
+            self._line = (0.0, 0.0)
+        before, warm = self._last
         time = max(time, before)
-        for key, lag in self._lags.items():
-            if not lag.of_sensor:
-                steps = (time - before) / lag.seconds
-                share = -math.expm1(-steps) / steps if steps > 0.0 else 1.0
-                self._behind[key] = (self._behind[key] * math.exp(-steps)
-                                     + (temperature - warm) * share)
-        if self._uses_rate:
-            self._average(time, temperature)
-        self._set_value(time, temperature)
+        rate = self._rate(time, temperature) if self._uses_rate else 0.0
+        value: dict[str, float] = {}
+        for key, (seconds, of_sensor) in self._lags.items():
+            if of_sensor:
+                value[key] = temperature + seconds * rate
+                continue
+            steps = (time - before) / seconds
+            share = -math.expm1(-steps) / steps if steps > 0.0 else 1.0
+            behind = self._behind[key] * math.exp(-steps) + (temperature - warm) * share
+            self._behind[key], value[key] = behind, temperature - behind
+        if self._gives_rate:
+            value['temperature_rate'] = rate
+        self._last, self.value = (time, temperature), value
 
-    def _average(self, time: float, temperature: float) -> None:
-        """Add a sample to the present average; a full average goes into the filter."""
+    def _rate(self, time: float, temperature: float) -> float:
+        """Return the rate with a sample in the present average; the filter takes full ones."""
         if time >= self._begin + _BIN:
             middle, mean = self._begin + self._times / self._count, self._sum / self._count
             if self._filter is None:
@@ -361,18 +331,12 @@ class ThermalStream:
             else:
                 self._filter.add(middle, mean)
             self._begin, self._count, self._times, self._sum = time, 0, 0.0, 0.0
-            self._line = self._filter.line(time)
+            _, rate, bend = self._filter.state.tolist()
+            self._line = rate + bend * (time - self._filter.time), bend
         self._count += 1
         self._times += time - self._begin
         self._sum += temperature
-
-    def _set_value(self, time: float, temperature: float) -> None:
-        self._last = time, temperature
-        rate = self._line[0] + self._line[1] * (time - self._begin) if self._uses_rate else 0.0
-        self.value = {key: temperature + lag.seconds * rate if lag.of_sensor
-                      else temperature - self._behind[key] for key, lag in self._lags.items()}
-        if self._gives_rate:
-            self.value['temperature_rate'] = rate
+        return self._line[0] + self._line[1] * (time - self._begin)
 
     def add_all(self, time: Floats, temperature: Floats) -> dict[str, Floats]:
         """
@@ -382,40 +346,13 @@ class ThermalStream:
         without time or temperature.
 
         """
-        keys = (*self._lags, *(('temperature_rate',) if self._gives_rate else ()))
-        found = {key: np.full(len(time), np.nan) for key in keys}
         order = np.argsort(time, kind='stable')
         order = order[np.isfinite(time[order] + temperature[order])]
-        if not len(order):
-            return found
-        moments, warm = time[order], temperature[order]
-        before, warm_before = self._before(float(moments[0]), float(warm[0]))
-        moments = np.maximum(moments, before)
-        rate = self._rates(moments, warm) if self._uses_rate else np.zeros(len(moments))
-        if self._gives_rate:
-            found['temperature_rate'][order] = rate
-        step, rise = np.diff(moments, prepend=before), np.diff(warm, prepend=warm_before)
-        for key, lag in self._lags.items():
-            if lag.of_sensor:
-                found[key][order] = warm + lag.seconds * rate
-                continue
-            behind = _decayed(np.append(before, moments), _behind(step, rise, lag.seconds, None),
-                              lag.seconds, self._behind[key])[1:]
-            found[key][order] = warm - behind
-            self._behind[key] = float(behind[-1])
-        self._set_value(float(moments[-1]), float(warm[-1]))
-        return found
-
-    def _rates(self, time: Floats, temperature: Floats) -> Floats:
-        """Return the rates at sorted samples, average by average."""
-        rate, first = np.empty(len(time)), 0
-        while first < len(time):
-            self._average(float(time[first]), float(temperature[first]))
-            last = max(int(np.searchsorted(time, self._begin + _BIN)), first + 1)
-            rest = slice(first + 1, last)
-            self._count += last - first - 1
-            self._times += float(np.sum(time[rest] - self._begin))
-            self._sum += float(np.sum(temperature[rest]))
-            rate[first:last] = self._line[0] + self._line[1] * (time[first:last] - self._begin)
-            first = last
-        return rate
+        keys = (*self._lags, *(('temperature_rate',) if self._gives_rate else ()))
+        values = array('d')
+        for moment, warm in zip(time[order].tolist(), temperature[order].tolist()):
+            self.add(moment, warm)
+            values.extend(self.value.values())
+        found = np.full((len(time), len(keys)), np.nan)
+        found[order] = np.reshape(values, (-1, len(keys)))
+        return dict(zip(keys, found.T))

@@ -79,39 +79,52 @@ def _find_way(poses_g: Poses, model: Model) -> Floats:
         turns = add_turns({**known, 'previous': way})
         return model.at({**turns, 'previous': previous}).force(poses_g.reading)
 
-    if np.array_equal(forces(way), forces(np.sign(way))):
-        both = [forces(np.broadcast_to(each, force.shape)) for each in _SIGNS]
-        return way_to(np.array(both), known, _SIGNS)
+    force = forces(way)
+    by_sign = np.array_equal(force, forces(np.sign(way)))
     for _ in range(_MOST_WAYS):
+        if by_sign:
+            each_sign = [forces(np.broadcast_to(signs, force.shape)) for signs in _SIGNS]
+            way = way_to(np.array(each_sign), known, _SIGNS)
+        else:
+            way = way_to(force[np.newaxis], known)
         before, force = force, forces(way)
-        way = way_to(force[np.newaxis], known)
         if np.max(np.abs(force - before), initial=0.0) < _SAME_G:
             break
     return way
 
 
 def add_turns(known: Context) -> Context:
-    """Return context with the time from the last turn to the start of each pose [s], if known."""
-    if 'time' not in known or 'since_turn' in known:
+    """
+    Return context with the way of the turn before the last one.
+
+    With the time, also with that from the last turn to the start of each pose [s].
+
+    """
+    if 'earlier' in known:
         return known
-    order = np.argsort(known['time'], kind='stable')
+    count = len(known['previous'])
+    order = np.argsort(known['time'], kind='stable') if 'time' in known else np.arange(count)
+    back, way = np.argsort(order), known['previous'][order]
+    turned = np.any(np.diff(way, axis=0, prepend=np.nan), axis=1)
+    first = np.maximum.accumulate(np.where(turned, np.arange(count), 0))
+    earlier = np.where(first[:, np.newaxis] > 0, way[first - 1], 0.0)[back]
+    if 'time' not in known or 'since_turn' in known:
+        return {**known, 'earlier': earlier}
     start = (known['time'] - known.get('duration', 0.0) / 2.0)[order]
-    turned = np.any(np.diff(known['previous'][order], axis=0, prepend=np.nan), axis=1)
-    first = np.maximum.accumulate(np.where(turned, np.arange(len(order)), 0))
     if 'duration' not in known:
         first = np.maximum(first - 1, 0)
-    return {**known, 'since_turn': (start - start[first])[np.argsort(order)]}
+    return {**known, 'earlier': earlier, 'since_turn': (start - start[first])[back]}
 
 
 def add_history(poses_g: Poses, model: Model) -> Poses:
     """
     Return poses in g with the context that comes from the poses before and after.
 
-    That is ``temperature_rate``, ``since_turn``, and ``previous``, the unit vector towards the
-    previous pose in order of time, or of rows; columns of the table are kept. A temperature in
-    steps is estimated between them. The directions are those that the model corrects. If it needs
-    ``previous`` for that, both are iterated; for a model that depends on its signs alone, all
-    signs are compared.
+    That is ``temperature_rate``, ``since_turn``, ``earlier``, and ``previous``, the unit vector
+    towards the previous pose in order of time, or of rows; columns of the table are kept. A
+    temperature in steps is estimated between them. The directions are those that the model
+    corrects. If it needs ``previous`` for that, both are iterated; for a model that depends on its
+    signs alone, all signs are compared.
 
     """
     if 'time' in poses_g and 'temperature' in poses_g and 'temperature_rate' not in poses_g:

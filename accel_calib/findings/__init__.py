@@ -23,25 +23,21 @@ it must not be used. All limits are in `LIMITS`.
 """
 
 from .figures import (
-    calibration_json, change_in_words, CROSS, curve_json, effect_figures, Expected, Figure,
-    figures_of, GAINS, GOOD_MG, in_words, Limit, LIMITS, linear_figures, OFFSETS, Outlook, outlook,
-    rating_json, refinement_json, residual_figures, scale_of)
-from .mounting import angle_words, mounting_figures, mounting_words
-from .outside import outside_line, outside_words, USES_LIMIT
-from .poses import combination_words, NOTHING_TO_PLAN, plan_lines, request_words
-from .rating import (
-    rate, rate_comparison, rate_fleet, rate_noise, rate_refinement, rate_verification)
-from .steps import (
-    advice_lines, base_words, chance_words, odds_words, place_words, rival_words, value_words,
-    verdict_words)
+    calibration_json, change_words, CROSS, effect_figures, Expected, Figure, figures_of, GAINS,
+    GOOD_MG, in_words, Limit, LIMITS, linear_figures, OFFSETS, Outlook, outlook, rating_json,
+    refinement_json, residual_figures, scale_of)
+from .rating import rate, rate_comparison, rate_fleet, rate_noise, rate_verification
+from .words import (
+    advice_lines, angle_words, base_words, chance_words, mounting_figures, mounting_words,
+    NOTHING_TO_PLAN, odds_words, outside_words, place_words, plan_lines, request_words,
+    rival_words, USES_LIMIT, value_words, verdict_words)
 from ..finding import Rating
 
 __all__ = ['CROSS', 'GAINS', 'GOOD_MG', 'LIMITS', 'NOTHING_TO_PLAN', 'OFFSETS', 'USES_LIMIT',
            'Expected', 'Figure', 'Limit', 'Outlook', 'Rating', 'advice_lines', 'angle_words',
-           'base_words', 'calibration_json', 'chance_words', 'change_in_words',
-           'combination_words', 'curve_json', 'effect_figures', 'figures_of', 'in_words',
-           'linear_figures', 'mounting_figures', 'mounting_words', 'odds_words', 'outlook',
-           'outside_line', 'outside_words', 'place_words', 'plan_lines', 'rate', 'rate_comparison',
-           'rate_fleet', 'rate_noise', 'rate_refinement', 'rate_verification', 'rating_json',
-           'refinement_json', 'request_words', 'residual_figures', 'rival_words', 'scale_of',
-           'value_words', 'verdict_words']
+           'base_words', 'calibration_json', 'chance_words', 'change_words',
+           'effect_figures', 'figures_of', 'in_words', 'linear_figures', 'mounting_figures',
+           'mounting_words', 'odds_words', 'outlook', 'outside_words', 'place_words', 'plan_lines',
+           'rate', 'rate_comparison', 'rate_fleet', 'rate_noise', 'rate_verification',
+           'rating_json', 'refinement_json', 'request_words', 'residual_figures', 'rival_words',
+           'scale_of', 'value_words', 'verdict_words']

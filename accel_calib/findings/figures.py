@@ -26,9 +26,9 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import scipy
 
-from .poses import combination_words, plan_lines, request_words
+from .words import combination_words, plan_lines, request_words
 from ..calibration import (
-    Calibration, Curve, determines, deviations_g, directions_in, error_left_in, free_parameters,
+    Calibration, determines, deviations_g, directions_in, error_left_in, free_parameters,
     Identifiability, identifiability, next_pose, NextPose, NORM_MODELS, ORIENTED, PRIOR, Quality,
     stated_uncertainty, uncertainty_g, Verification)
 from ..comparison import NAMES
@@ -36,14 +36,13 @@ from ..effects import (
     AXES, effect_named, EffectKey, entry_of, LADDER, Model, MODELS, ParameterName, predict,
     value_unit)
 from ..estimate import pose_noise, sensing_axes, variance_factor
-from ..finding import Rating
+from ..finding import NextStep, Rating
 from ..statistics import rms
-from ..table import Floats
 from ..text import signed
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..refinement import Refinement, Step
+    from ..refinement import Refinement
 
 _OPEN_PART = 0.1
 """Part of a parameter in the open combinations above which it is not determined."""
@@ -131,14 +130,14 @@ def scale_of(name: str) -> tuple[float, float, str]:
 
 def in_words(name: str, value: float, sd: float) -> str:
     """Return a parameter as ``+value ± sd unit``."""
-    zero, _, _ = scale_of(name)
-    return change_in_words(name, value - zero, sd)
+    zero, factor, unit = scale_of(name)
+    return signed((value - zero) * factor, sd * factor, unit)
 
 
-def change_in_words(name: str, change: float, sd: float) -> str:
-    """Return the change of a parameter as ``+value ± sd unit``."""
+def change_words(name: str, change: float, sd: float) -> str:
+    """Return the change of a parameter with its name, such as ``offset x +0.3 ± 0.1 mg``."""
     _, factor, unit = scale_of(name)
-    return signed(change * factor, sd * factor, unit)
+    return f'{name.replace(".", " ")} {signed(change * factor, sd * factor, unit)}'
 
 
 @dataclass(frozen=True)
@@ -179,6 +178,9 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
 def calibration_json(calibration: Calibration, ahead: Outlook) -> dict[str, Any]:
     """Return a calibration for JSON, with what its poses determine; None: not known."""
     gyro, noise = calibration.gyro, calibration.noise
+    measured = {} if noise is None else {
+        name: values for name, values in (('force', noise.force), ('rate', noise.rate))
+        if not np.isnan(values).all()}
     seen, asked = ahead.identifiability, ahead.next_pose
     part = {name: sum(open_.weights.get(name, 0.0) ** 2 for open_ in seen.undetermined)
             for name in seen.deviations}
@@ -202,7 +204,7 @@ def calibration_json(calibration: Calibration, ahead: Outlook) -> dict[str, Any]
         **asdict(calibration.quality), 'reason': calibration.reason,
         'warnings': calibration.warnings, **own_names,
         'gyro_bias': gyro and gyro.bias, 'gyro_bias_sd': gyro and gyro.sd,
-        'noise_force': noise and _known(noise.force), 'noise_rate': noise and _known(noise.rate),
+        'noise_force': measured.get('force'), 'noise_rate': measured.get('rate'),
         'uncertainty_mg': ahead.uncertainty_mg,
         'identifiability': {
             'model': seen.model, 'dilution': seen.dilution, 'mean_dilution': seen.mean_dilution,
@@ -215,16 +217,15 @@ def calibration_json(calibration: Calibration, ahead: Outlook) -> dict[str, Any]
             'direction': asked.direction, 'words': request_words(asked)}}
 
 
-def _known(values: Floats) -> Floats | None:
-    return None if np.isnan(values).all() else values
-
-
 def refinement_json(result: Refinement) -> dict[str, Any]:
     return {
         'verdict': result.verdict, 'undecided': result.undecided, 'base': result.calibration.name,
         'poses_used': len(result.poses_g), 'noise_floor_mg': result.noise_floor_mg,
         'gap_mg': result.gap_mg,
-        'steps': [_step_json(step) for step in result.steps],
+        'steps': [{
+            **{'where' if key == 'place' else key: value for key, value in asdict(step).items()},
+            'where': step.where, 'name': str(step.name), 'words': entry_of(step.name).words}
+            for step in result.steps],
         'remaining_gap_mg': result.remaining_gap_mg,
         'disturbed_poses': result.disturbed_poses,
         'not_testable': [{'effect': effect, 'needs': needs}
@@ -234,26 +235,11 @@ def refinement_json(result: Refinement) -> dict[str, Any]:
         'refusal': result.refusal[0] if result.refusal else None}
 
 
-def _step_json(step: Step) -> dict[str, Any]:
-    found = {'where' if key == 'place' else key: value for key, value in asdict(step).items()}
-    return {**found, 'where': step.where, 'name': str(step.name),
-            'words': entry_of(step.name).words}
-
-
-def curve_json(curve: Curve) -> dict[str, Any]:
-    """Return the effects of temperature for JSON."""
-    return {
-        'reference_c': curve.reference_c, 'range_c': curve.range_c, 'degree': curve.degree,
-        'effects': [*map(str, curve.model.effects)], 'band_mg': curve.band_mg,
-        'change_mg': curve.change_mg, 'residual_mg': curve.residual_mg,
-        'held_out_mg': curve.held_out_mg}
-
-
-def rating_json(rating: Rating, kind: str, text: str, command: str) -> dict[str, Any]:
-    """Return a rating for JSON, with the kind of the next step, its words and its command."""
+def rating_json(rating: Rating, step: NextStep, command: str) -> dict[str, Any]:
+    """Return a rating for JSON, with the next step and its command."""
     return {'rating': rating.name, 'rating_reason': rating.reason,
             'findings': [each.stated for each in rating.findings],
-            'next': {'kind': kind, 'text': text, 'command': command}}
+            'next': {'kind': step.kind, 'text': step.text, 'command': command}}
 
 
 # ----------------------------------------------------------------------------- expected error
@@ -347,49 +333,67 @@ class Expected:
     """The expected error of a calibration in new orientations, and its parts."""
 
     def __init__(self, calibration: Calibration) -> None:
-        self.calibration = calibration
+        quality, effects = calibration.quality, calibration.model.effects
+        self.calibration, self.quality = calibration, quality
         self.poses = calibration.used_poses
-        self.quality = calibration.quality
         self.directions = directions_in(self.poses, calibration)
         self.noise = pose_noise(self.poses.noise, self.directions)
-        # Whether the errors are those of the force as a vector, not of its length.
-        self.is_vector = calibration.form.known_orientation and 'reference' in self.poses
+        # The rows that were left out as outliers.
+        self.outliers = tuple(each.row for each in calibration.rejected if each.kind == 'outlier')
         # Whether the sensor could not be turned over.
         self.is_partial = calibration.method == PRIOR
         # The name of the smaller model if values that every sensor has are omitted.
-        effects = {name for name in calibration.model.effects if name in LADDER}
-        self.omits = next((name for name in ('4', '7') if {*MODELS[name].effects} == effects), '')
-        # The number of equations of distinct poses beyond the number of free values.
-        rows = 3 if self.is_vector else 1
+        known = {*effects} & {*LADDER}
+        self.omits = next((name for name in ('4', '7') if {*MODELS[name].effects} == known), '')
+        # The number of equations of distinct poses beyond the number of free values. The errors
+        # of poses with known forces are vectors.
+        rows = 3 if calibration.form.known_orientation and 'reference' in self.poses else 1
         free = (free_parameters(calibration.name) if calibration.form.sensing_axes
                 else int(np.count_nonzero(np.diag(calibration.covariance))))
-        self.dof = max(len(np.unique(self.poses.reading, axis=0)) * rows - free, 0)
+        dof = max(len(np.unique(self.poses.reading, axis=0)) * rows - free, 0)
+        self.dof = dof
         # The ratio of an error to its residual after a fit.
-        self._per_dof = math.sqrt(len(self.poses) * rows / self.dof) if self.dof else 1.0
+        per_dof = math.sqrt(len(self.poses) * rows / dof) if dof else 1.0
         # The noise of a pose [mg], RMS over the poses; None if it is not known.
-        floor = self.quality.noise_floor_mg
-        self.noise_mg = None if floor is None else floor * self._per_dof
+        floor, chi2 = quality.noise_floor_mg, quality.chi2_per_dof
+        self.noise_mg = None if floor is None else floor * per_dof
         # The error without the calibration, without noise [mg]; None if it is not known.
         self.before_mg = None if calibration.units.is_native else without_noise(
-            self.quality.rms_before_mg, self.noise_mg)
+            quality.rms_before_mg, self.noise_mg)
+        # The stated uncertainty, RMS over the sphere [mg]; partial: over the poses.
+        self.stated_mg = MG * (
+            rms(deviations_g(calibration, self.directions)) if self.is_partial and effects else
+            stated_uncertainty(calibration) or 0.0)
+        # The largest stated uncertainty over the sphere [mg].
+        self.worst_mg = uncertainty_g(calibration) * MG if effects else 0.0
+        # The factor on the uncertainty because few poses check the noise, and the ratio of the
+        # largest scatter that their squares allow to its RMS.
+        self.few = scatter = 1.0
+        if dof:
+            scatter = math.sqrt(dof / float(scipy.special.chdtri(dof, 1.0 - _UNLUCKY)))
+        if dof and chi2 is not None:
+            self.few = max(math.sqrt(chi2 / variance_factor(chi2 * dof, dof, True)) * scatter, 1.0)
+        # The residual beyond the noise [mg]; without known noise, the residual.
+        self.hidden_mg = 0.0
+        if dof and not self.is_partial:
+            if floor is None or chi2 is None:
+                self.hidden_mg = quality.rms_after_mg * per_dof
+            elif scipy.special.chdtrc(dof, chi2 * dof) <= _LEVEL:
+                self.hidden_mg = without_noise(quality.rms_after_mg, floor) * per_dof
+        # Whether the poses show what the model does not contain.
+        self.is_beyond_noise = self.noise_mg is not None and self.hidden_mg >= max(
+            MATTERS.value, self.noise_mg * math.sqrt(HIDDEN.value ** 2 - 1.0))
+        # The part of the expected error that more poses reduce, and the whole, as a bound [mg].
+        self.inexact_mg = math.hypot(BOUND * self.stated_mg * self.few, self.omitted_mg)
+        self.error_mg = math.hypot(
+            self.inexact_mg, self.hidden_mg * (1.0 if self.noise_mg is None else scatter),
+            *(size for _, size in self.not_corrected))
+        # The expected error by what the poses show, without omitted values [mg].
+        self.own_mg = math.hypot(self.stated_mg, self.hidden_mg)
 
     @cached_property
     def next_pose(self) -> NextPose:
         return next_pose(self.directions, self.calibration.form.largest, self.noise)
-
-    @cached_property
-    def stated_mg(self) -> float:
-        """Return the stated uncertainty, RMS over the sphere [mg]; partial: over the poses."""
-        if self.is_partial and self.calibration.model.effects:
-            return rms(deviations_g(self.calibration, self.directions)) * MG
-        return (stated_uncertainty(self.calibration) or 0.0) * MG
-
-    @cached_property
-    def worst_mg(self) -> float:
-        """Return the largest stated uncertainty over the sphere [mg]."""
-        if not self.calibration.model.effects:
-            return 0.0
-        return uncertainty_g(self.calibration) * MG
 
     @cached_property
     def omitted_mg(self) -> float:
@@ -405,27 +409,6 @@ class Expected:
         return min(_UNSEEN * self.stated_mg * math.sqrt(max(ratio, 0.0)), typical)
 
     @cached_property
-    def few(self) -> float:
-        """Return the factor on the uncertainty because few poses check the noise."""
-        chi2 = self.quality.chi2_per_dof
-        if chi2 is None or not self.dof:
-            return 1.0
-        stated = variance_factor(chi2 * self.dof, self.dof, True)
-        return max(math.sqrt(chi2 / stated) * _few(self.dof), 1.0)
-
-    @cached_property
-    def hidden_mg(self) -> float:
-        """Return the residual beyond the noise [mg]; without known noise, the residual."""
-        quality = self.quality
-        if not self.dof or self.is_partial:
-            return 0.0
-        if quality.noise_floor_mg is None or quality.chi2_per_dof is None:
-            return quality.rms_after_mg * self._per_dof
-        if scipy.special.chdtrc(self.dof, quality.chi2_per_dof * self.dof) > _LEVEL:
-            return 0.0
-        return without_noise(quality.rms_after_mg, quality.noise_floor_mg) * self._per_dof
-
-    @cached_property
     def not_corrected(self) -> tuple[tuple[EffectKey, float], ...]:
         """
         Return effects that the correction of a later sample cannot use, the largest first.
@@ -438,45 +421,18 @@ class Expected:
         if 'std' in self.poses:
             context['std'] = calibration.units.to_g(self.poses['std'])
         for name, values in calibration.model.values.items():
-            if depends_on(name) & {*_ONLY_AT_POSES, *calibration.model.neutral}:
+            entry = entry_of(name)
+            if {*(entry.over or entry.needs)} & {*_ONLY_AT_POSES, *calibration.model.neutral}:
                 alone = Model({name: values})
                 known = all(key in context for key in alone.needs)
                 along = np.sum((predict(alone, up, context) - up) * up, axis=1) if known else up
                 sizes[name] = rms(along) * MG if known else 0.0
         return tuple(sorted(sizes.items(), key=lambda each: -each[1]))
 
-    @cached_property
-    def error_mg(self) -> float:
-        """Return the expected error, as a bound [mg]."""
-        few = _few(self.dof) if self.noise_mg is not None and self.dof else 1.0
-        return math.hypot(self.inexact_mg, self.hidden_mg * few,
-                          *(size for _, size in self.not_corrected))
-
-    @property
-    def own_mg(self) -> float:
-        """Return the expected error by what the poses show, without omitted values [mg]."""
-        return math.hypot(self.stated_mg, self.hidden_mg)
-
-    @property
-    def inexact_mg(self) -> float:
-        """Return the part of the expected error that more poses reduce [mg]."""
-        return math.hypot(BOUND * self.stated_mg * self.few, self.omitted_mg)
-
-
-def _few(dof: int) -> float:
-    """Return the ratio of the largest scatter that `dof` squares allow to their RMS."""
-    return math.sqrt(dof / float(scipy.special.chdtri(dof, 1.0 - _UNLUCKY)))
-
 
 def without_noise(residual_mg: float, noise_mg: float | None) -> float:
     """Return the part of an RMS that is not noise."""
     return math.sqrt(max(residual_mg ** 2 - (noise_mg or 0.0) ** 2, 0.0))
-
-
-def depends_on(name: EffectKey) -> set[str]:
-    """Return the context that an effect is a function of."""
-    effect = entry_of(name)
-    return set(effect.over or effect.needs)
 
 
 def number(value: float) -> str:

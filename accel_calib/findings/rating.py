@@ -13,21 +13,21 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 import math
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 from .figures import (
-    BAD_ERROR, BOUND, CHANGED, COVERED, degrees, depends_on, Expected, FAR_OFF, GOOD_ERROR, HIDDEN,
-    LEFT_OUT, MANY_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK,
-    TOO_EXACT, without_noise, WORST_ERROR)
-from .poses import request_words
+    BAD_ERROR, BOUND, CHANGED, COVERED, degrees, Expected, FAR_OFF, GOOD_ERROR, LEFT_OUT, MANY_OUT,
+    MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK, TOO_EXACT, without_noise,
+    WORST_ERROR)
+from .words import request_words
 from ..calibration import (
     Calibration, directions_in, flat_direction, free_parameters, lies_in_plane, Verification)
 from ..comparison import Comparison, LEVEL
-from ..effects import EmpiricalCurve, WANDER
+from ..effects import EmpiricalCurve, entry_of, WANDER
 from ..errors import TAKE_ALL_SIDES
-from ..finding import Finding, NextStep, ranked, rated, Rating, without
+from ..finding import Finding, NextStep, rated, Rating, without
 from ..geometry import coverage, distinct
 from ..table import is_quantity, Poses, range_of
 from ..text import counted, listed
@@ -37,9 +37,8 @@ if TYPE_CHECKING:
     from ..noise import NoiseFigures
     from ..refinement import Refinement
 
-_REFINE = NextStep('refine', 'run refine to find the missing effect')
-_CHECK = NextStep('poses', 'check what differs between the poses, clamp the sensor, and take the '
-                  'poses again')
+_REFINE = 'run refine to find the missing effect'
+_CHECK = 'check what differs between the poses, clamp the sensor, and take the poses again'
 
 
 def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> Rating:
@@ -64,66 +63,58 @@ def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> R
     figures += ['noise not known' if noise is None else f'noise {mg(noise)}',
                 counted(len(expected.poses), 'pose'),
                 f'{100.0 * quality.coverage:.0f} % of the sphere']
-    named = [*_beyond_noise(expected, refinement), *_not_corrected(expected)]
+    named = [*_find_missing(expected, refinement)]
     error = expected.inexact_mg if named else expected.error_mg
-    own = [*_too_large(expected, refinement), *_figures_beyond_limits(expected, refinement),
-           *_limited(expected), *_checked(expected), *named,
-           *_inexact(expected, error, refinement)]
+    own = [*_find_failures(expected, refinement), *_find_wild_figures(expected, refinement),
+           *_find_limits(expected), *_find_unchecked(expected), *named,
+           *_find_inexact(expected, error, refinement)]
     noted = without(calibration.noted, *(each.kind for each in own))
-    return rated(ranked((*own, *noted)), good, ', '.join(figures), step_after(calibration))
+    return rated((*own, *noted), good, ', '.join(figures), step_after(calibration))
 
 
-def rate_refinement(result: Refinement) -> Rating:
-    return rate(result.calibration, refinement=result)
-
-
-def _too_large(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
+def _find_failures(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
     """Yield a finding if the calibration is refused, or the readings are as good without it."""
-    if refinement is not None and refinement.refusal and _has(expected, refinement):
+    if (refinement is not None and refinement.refusal
+            and expected.calibration.model.effects == refinement.calibration.model.effects):
         message, advice = refinement.refusal
         yield Finding('refused', message, advice, 'BAD')
-    own, remedy = expected.own_mg, _remedy(expected, refinement)
-    before, calibrated = expected.before_mg, bool(expected.calibration.model.effects)
+    own, before, is_partial = expected.own_mg, expected.before_mg, expected.is_partial
     if expected.noise_mg is None and expected.dof < TO_CHECK.value:
         return  # the uncertainty is hardly known
     if own > BAD_ERROR.value:
         yield Finding('error', f'the error in new orientations is {mg(own)}, expected at most '
-                      f'{mg(BAD_ERROR.value)}', remedy.text, 'BAD', step=remedy.kind)
-    elif calibrated and before is not None and own > max(before, MATTERS.value) and (
-            not expected.is_partial):
+                      f'{mg(BAD_ERROR.value)}', level='BAD', **_remedy(expected, refinement))
+    elif (expected.calibration.model.effects and not is_partial and before is not None
+          and own > max(before, MATTERS.value)):
         yield Finding('no_gain', f'the error in new orientations is {mg(own)}, and {mg(before)} '
-                      'without the calibration', remedy.text,
-                      'BAD' if own > WORST_ERROR.value else 'USABLE', step=remedy.kind)
+                      'without the calibration', level='BAD' if own > WORST_ERROR.value else
+                      'USABLE', **_remedy(expected, refinement))
 
 
-def _figures_beyond_limits(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
+def _find_wild_figures(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
     """Yield a finding for each figure of the first line that no useful calibration has."""
-    quality, remedy = expected.quality, _remedy(expected, refinement)
+    quality = expected.quality
     held_out, noise = quality.held_out_rms_mg, quality.noise_floor_mg
     if held_out is not None and held_out > BAD_ERROR.value and not expected.is_partial:
         yield Finding('held_out', 'orientations that the fit has not seen are wrong by '
-                      f'{mg(held_out)}, expected at most {mg(BAD_ERROR.value)}', remedy.text,
-                      'BAD', step=remedy.kind)
+                      f'{mg(held_out)}, expected at most {mg(BAD_ERROR.value)}', level='BAD',
+                      **_remedy(expected, refinement))
     if noise is None or expected.dof < TO_CHECK.value or not expected.calibration.model.effects:
         return
-    rows = _outliers(expected)
+    rows = expected.outliers
     many = 100.0 * len(rows) > MANY_OUT.value * len(expected.calibration.poses)
     if many and quality.rms_after_mg > FAR_OFF.value * noise:
         yield Finding('far_off', f'the residual is {quality.rms_after_mg / noise:.0f} times the '
                       f'noise beside {counted(len(rows), "outlier")}: the model does not hold, '
-                      f'expected at most {FAR_OFF.value:.0f} times', remedy.text, 'BAD', rows,
-                      step=remedy.kind)
+                      f'expected at most {FAR_OFF.value:.0f} times', level='BAD', rows=rows,
+                      **_remedy(expected, refinement))
     elif quality.rms_after_mg * TOO_EXACT.value < noise:
         yield Finding('too_exact', f'the residual is {mg(quality.rms_after_mg)}, far '
                       f'below the noise of {mg(noise)}: these readings are computed, not measured',
                       'take the readings of the sensor itself', 'BAD')
 
 
-def _outliers(expected: Expected) -> tuple[int, ...]:
-    return tuple(each.row for each in expected.calibration.rejected if each.kind == 'outlier')
-
-
-def _limited(expected: Expected) -> Iterator[Finding]:
+def _find_limits(expected: Expected) -> Iterator[Finding]:
     """Yield what the calibration is not for, and findings about poses that are left out."""
     if not expected.calibration.model.effects:
         yield Finding('mounting_alone', 'it is a mounting alone: offset and gain are not '
@@ -148,14 +139,15 @@ def _limited(expected: Expected) -> Iterator[Finding]:
                       'USABLE', tuple(each.row for each in left_out))
 
 
-def _checked(expected: Expected) -> Iterator[Finding]:
+def _find_unchecked(expected: Expected) -> Iterator[Finding]:
+    """Yield what the poses do not check."""
     if expected.is_partial or not expected.calibration.model.effects:
         return
-    out = _outliers(expected)
+    out = expected.outliers
     if expected.dof == 0:
         yield Finding('no_check', 'nothing checks the fit: there are only as many poses as values',
                       _more_poses(expected), 'USABLE')
-    elif (expected.quality.held_out_rms_mg is None and _is_beyond_noise(expected)
+    elif (expected.quality.held_out_rms_mg is None and expected.is_beyond_noise
           and distinct(expected.directions) <= free_parameters(expected.calibration.name)):
         yield Finding('no_check', 'the poses of one orientation differ by more than their noise, '
                       'and no orientation checks the others', _more_poses(expected), 'BAD')
@@ -178,60 +170,47 @@ def _checked(expected: Expected) -> Iterator[Finding]:
                       'take these poses again', 'USABLE', tuple(rows))
 
 
-def _is_beyond_noise(expected: Expected) -> bool:
-    hidden, noise = expected.hidden_mg, expected.noise_mg
-    return noise is not None and hidden >= max(
-        MATTERS.value, noise * math.sqrt(HIDDEN.value ** 2 - 1.0))
-
-
-def _beyond_noise(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
-    """Yield a finding if the poses show what the model does not contain."""
-    if not _is_beyond_noise(expected):
-        return
-    hidden = expected.hidden_mg
-    begin, step = f'{mg(hidden)} of the residual are not noise', 'poses'
-    if refinement is None:
-        what = f'{begin}: an effect is missing, or poses moved'
-        advice, step = _REFINE.text, _REFINE.kind
-    elif refinement.steps and not _has(expected, refinement):
-        names = ' and '.join(step.effect for step in refinement.steps)
-        what = f'{begin}; the model lacks {names}'
-        advice, step = 'use the refined calibration', 'refine'
-        if refinement.refusal:
-            why, advice = refinement.refusal
-            what, step = f'{begin}, and the model that explains them is refused: {why}', 'poses'
-    elif any(step.effect == WANDER for step in refinement.steps):
-        what = f'{begin}: the offset changed slowly with time ({WANDER})'
-        advice = 'let the sensor warm up, and take the poses within a few minutes'
-    else:
-        what = f'{begin}, and no effect explains them'
-        advice = _CHECK.text
-    yield Finding('beyond_noise', what, advice, 'USABLE', step=step)
-
-
-def _has(expected: Expected, refinement: Refinement) -> bool:
-    """Return whether a calibration has the effects of a refinement."""
-    return expected.calibration.model.effects == refinement.calibration.model.effects
-
-
-def _not_corrected(expected: Expected) -> Iterator[Finding]:
-    """Yield the effects of the model that a later sample is not corrected for."""
+def _find_missing(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
+    """Yield what the poses show beside the model, and what later samples are not corrected for."""
+    effects = expected.calibration.model.effects
+    if expected.is_beyond_noise:
+        begin, step = f'{mg(expected.hidden_mg)} of the residual are not noise', 'poses'
+        if refinement is None:
+            what = f'{begin}: an effect is missing, or poses moved'
+            advice, step = _REFINE, 'refine'
+        elif refinement.steps and effects != refinement.calibration.model.effects:
+            names = ' and '.join(step.effect for step in refinement.steps)
+            what = f'{begin}; the model lacks {names}'
+            advice, step = 'use the refined calibration', 'refine'
+            if refinement.refusal:
+                why, advice = refinement.refusal
+                what = f'{begin}, and the model that explains them is refused: {why}'
+                step = 'poses'
+        elif any(step.effect == WANDER for step in refinement.steps):
+            what = f'{begin}: the offset changed slowly with time ({WANDER})'
+            advice = 'let the sensor warm up, and take the poses within a few minutes'
+        else:
+            what, advice = f'{begin}, and no effect explains them', _CHECK
+        yield Finding('beyond_noise', what, advice, 'USABLE', step=step)
     for name, size in expected.not_corrected:
-        if size > MATTERS.value:
-            short = 'a curve' if isinstance(name, EmpiricalCurve) else name
-            if 'time' in depends_on(name) and 'since_turn' not in depends_on(name):
-                yield Finding('settling', f'the readings changed with time by {mg(size)} '
-                              f'({short}), and may change again', 'let the sensor settle, and '
-                              'take the poses again', 'USABLE')
-            else:
-                columns = ' and '.join(filter(
-                    is_quantity, depends_on(name) & {*expected.calibration.model.neutral}))
-                where = f'without the column {columns}' if columns else 'in single samples'
-                yield Finding('not_corrected', f'{short} of {mg(size)} cannot be corrected '
-                              f'{where}', level='USABLE')
+        if size <= MATTERS.value:
+            continue
+        short, entry = 'a curve' if isinstance(name, EmpiricalCurve) else name, entry_of(name)
+        context = {*(entry.over or entry.needs)}
+        if 'time' in context and 'since_turn' not in context:
+            yield Finding('settling', f'the readings changed with time by {mg(size)} ({short}), '
+                          'and may change again', 'let the sensor settle, and take the poses '
+                          'again', 'USABLE')
+        else:
+            columns = ' and '.join(filter(
+                is_quantity, context & {*expected.calibration.model.neutral}))
+            where = f'without the column {columns}' if columns else 'in single samples'
+            yield Finding('not_corrected', f'{short} of {mg(size)} cannot be corrected {where}',
+                          level='USABLE')
 
 
-def _inexact(expected: Expected, error: float, refinement: Refinement | None) -> Iterator[Finding]:
+def _find_inexact(expected: Expected, error: float, refinement: Refinement | None
+                  ) -> Iterator[Finding]:
     """Yield a finding if an error that has no name yet is too large [mg]."""
     if expected.is_partial or not expected.calibration.model.effects:
         return
@@ -240,10 +219,9 @@ def _inexact(expected: Expected, error: float, refinement: Refinement | None) ->
         yield Finding('omitted', f'model {expected.omits} omits what these poses do not '
                       f'determine: the error may be {mg(error)}', _more_poses(expected), 'USABLE')
     elif large:
-        remedy = _remedy(expected, refinement)
         yield Finding('new_orientations', f'the error in new orientations is up to {mg(error)}, '
-                      f'expected at most {mg(GOOD_ERROR.value)}', remedy.text, 'USABLE',
-                      step=remedy.kind)
+                      f'expected at most {mg(GOOD_ERROR.value)}', level='USABLE',
+                      **_remedy(expected, refinement))
     elif expected.worst_mg > WORST_ERROR.value:
         yield Finding('far_from_poses', f'the error is up to {mg(expected.worst_mg)} where there '
                       f'is no pose, expected at most {mg(WORST_ERROR.value)}',
@@ -259,16 +237,15 @@ def _more_poses(expected: Expected) -> str:
     return f'take {poses}: {request_words(asked)}'
 
 
-def _remedy(expected: Expected, refinement: Refinement | None) -> NextStep:
-    """Return what reduces the larger part of the error."""
+def _remedy(expected: Expected, refinement: Refinement | None) -> dict[str, Any]:
+    """Return advice and step of a finding: what reduces the larger part of the error."""
     if expected.hidden_mg <= BOUND * expected.stated_mg:
-        return NextStep('poses', _more_poses(expected))
+        return {'advice': _more_poses(expected), 'step': 'poses'}
     if refinement is not None:
-        return _CHECK
-    if expected.noise_mg is None:
-        return NextStep('refine', 'hold the sensor still in each pose, record std and count, and '
-                        'run refine to find what is missing')
-    return _REFINE
+        return {'advice': _CHECK, 'step': 'poses'}
+    return {'step': 'refine', 'advice': _REFINE if expected.noise_mg is not None else
+            'hold the sensor still in each pose, record std and count, and run refine to find '
+            'what is missing'}
 
 
 def step_after(calibration: Calibration) -> NextStep:
@@ -309,10 +286,28 @@ def rate_verification(verification: Verification, calibration: Calibration,
         of the calibration itself.
 
     """
-    expected, floor = Expected(calibration), verification.noise_floor_mg
-    own = rate(calibration)
-    error = without_noise(verification.rms_after_mg, floor)
-    found = [*_on_new_poses(verification, expected, own, error)]
+    expected, own = Expected(calibration), rate(calibration)
+    floor, again = verification.noise_floor_mg, 'fit again with these poses'
+    before, error = (without_noise(each, floor)
+                     for each in (verification.rms_before_mg, verification.rms_after_mg))
+    found, what = [], f'the error of these poses is {mg(error)}'
+    if error > BAD_ERROR.value:
+        found.append(Finding('error', f'{what}, expected at most {mg(BAD_ERROR.value)}', again,
+                             'BAD', step='fit'))
+    elif not calibration.units.is_native and error > max(before, floor or 0.0):
+        found.append(Finding('no_gain', f'{what}, and {mg(before)} without the calibration', again,
+                             'BAD' if error > MATTERS.value else 'USABLE', step='fit'))
+    stated = expected.error_mg
+    if own.name == 'GOOD' and error > max(CHANGED.value * stated, MATTERS.value):
+        found.append(Finding('changed', f'{what}, and the fit states {mg(stated)}: the sensor has '
+                             'changed', again, 'USABLE'))
+    elif error > GOOD_ERROR.value:
+        found.append(Finding('error', f'{what}, expected at most {mg(GOOD_ERROR.value)}', again,
+                             'USABLE', step='fit'))
+    if floor is not None and floor > GOOD_ERROR.value:
+        found.append(Finding('noise', f'the noise of these poses is {mg(floor)}, too large to see '
+                             f'an error of {mg(GOOD_ERROR.value)}', 'hold the sensor longer in '
+                             'each pose', 'USABLE'))
     covered = 1.0 if poses is None else coverage(directions_in(poses, calibration))
     if expected.is_partial or covered < COVERED.value / 100.0:
         found += own.findings
@@ -321,34 +316,7 @@ def rate_verification(verification: Verification, calibration: Calibration,
                f'largest {mg(verification.max_after_percent * MG / 100.0)}, {noise}')
     if poses is not None:
         figures += f', {counted(len(poses), "pose")}, {100.0 * covered:.0f} % of the sphere'
-    good = f'the error of these poses is {mg(error)} ({degrees(error)} of tilt)'
-    return rated(found, good, figures, step_after(calibration))
-
-
-def _on_new_poses(verification: Verification, expected: Expected, own: Rating, error: float
-                  ) -> Iterator[Finding]:
-    floor, again = verification.noise_floor_mg, 'fit again with these poses'
-    native = expected.calibration.units.is_native
-    before = without_noise(verification.rms_before_mg, floor)
-    if error > BAD_ERROR.value:
-        yield Finding('error', f'the error of these poses is {mg(error)}, expected at most '
-                      f'{mg(BAD_ERROR.value)}', again, 'BAD', step='fit')
-    elif not native and error > max(before, floor or 0.0):
-        yield Finding('no_gain', f'the error of these poses is {mg(error)}, and {mg(before)} '
-                      'without the calibration', again,
-                      'BAD' if error > MATTERS.value else 'USABLE', step='fit')
-    stated = expected.error_mg
-    changed = error > max(CHANGED.value * stated, MATTERS.value)
-    if changed and own.name == 'GOOD':
-        yield Finding('changed', f'the error of these poses is {mg(error)}, and the fit states '
-                      f'{mg(stated)}: the sensor has changed', again, 'USABLE')
-    elif error > GOOD_ERROR.value:
-        yield Finding('error', f'the error of these poses is {mg(error)}, expected at most '
-                      f'{mg(GOOD_ERROR.value)}', again, 'USABLE', step='fit')
-    if floor is not None and floor > GOOD_ERROR.value:
-        yield Finding('noise', f'the noise of these poses is {mg(floor)}, too large to see an '
-                      f'error of {mg(GOOD_ERROR.value)}', 'hold the sensor longer in each pose',
-                      'USABLE')
+    return rated(found, f'{what} ({degrees(error)} of tilt)', figures, step_after(calibration))
 
 
 def rate_comparison(comparison: Comparison) -> Rating:

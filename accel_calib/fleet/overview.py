@@ -42,7 +42,7 @@ import numpy as np
 import scipy
 
 from .recording import Row, UNKNOWN
-from .sensors import alike, model_of, Store
+from .sensors import alike, model_of, read_parquet, Store
 from ..calibration import FleetPrior
 from ..comparison import NAMES
 from ..effects import LADDER
@@ -76,28 +76,28 @@ Odd = tuple[str, str, float, float]
 """Sensor, name of a value, the value, and its distance from the median in spreads."""
 
 
+@dataclass
 class Months:
     """The differences of calibrations from the median of their sensor, a sample by month."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
-        self._rng = rng
-        self._kept: dict[str, Floats] = {}
-        self.counts: dict[str, int] = defaultdict(int)
+    rng: np.random.Generator
+    kept: dict[str, Floats] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
 
     def add(self, month: str, differences: Floats) -> None:
         """Add the (9,) differences of a calibration; each has the same chance to be kept."""
-        kept = self._kept.setdefault(month, np.empty((_SAMPLE, len(NAMES))))
+        kept = self.kept.setdefault(month, np.empty((_SAMPLE, len(NAMES))))
         place = self.counts[month]
         self.counts[month] += 1
         if place >= _SAMPLE:
-            place = int(self._rng.integers(self.counts[month]))
+            place = int(self.rng.integers(self.counts[month]))
         if place < _SAMPLE:
             kept[place] = differences
 
     def quantiles(self, parts: Sequence[float]) -> tuple[list[str], Floats]:
         """Return the months with `FEWEST` or more calibrations, and (months, parts, 9) values."""
         months = [month for month in sorted(self.counts) if self.counts[month] >= FEWEST]
-        return months, np.array([np.quantile(self._kept[month][:self.counts[month]], parts, axis=0)
+        return months, np.array([np.quantile(self.kept[month][:self.counts[month]], parts, axis=0)
                                  for month in months])
 
 
@@ -141,7 +141,7 @@ class Digest:
 
 def digest_of(name: str, store: Store) -> Digest:
     """Return the digest of a sensor by the name of its folder; it runs on a worker."""
-    return digest(unquote(name), store.of_sensor(name, COLUMNS))
+    return digest(unquote(name), read_parquet(store.data(name), COLUMNS))
 
 
 def digest(sensor: str, rows: Sequence[Row]) -> Digest:
@@ -158,10 +158,11 @@ def digest(sensor: str, rows: Sequence[Row]) -> Digest:
         differences = [(row['date'][:7], change) for row, change in zip(good, away, strict=True)
                        if row.get('date') and len(good) > 1]
     return Digest(
-        sensor, model_of(rows), Counter(row['rating'] or row['status'] for row in rows),
-        [row for row in rows if row['status'] != 'ok'][:MOST_ERRORS],
-        sum(bool(row['calibration']) for row in rows) - len(good), known, differences,
-        typical_of(named))
+        sensor=sensor, model=model_of(rows), values=known, differences=differences,
+        counts=Counter(row['rating'] or row['status'] for row in rows),
+        errors=[row for row in rows if row['status'] != 'ok'][:MOST_ERRORS],
+        left_out=sum(bool(row['calibration']) for row in rows) - len(good),
+        typical=typical_of(named))
 
 
 @dataclass(frozen=True)

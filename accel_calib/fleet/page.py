@@ -13,6 +13,7 @@ does not show; `sensors.parquet` and the rows of the recordings have all of them
 
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
+from importlib.util import find_spec
 from itertools import islice
 from typing import Any
 from urllib.parse import unquote
@@ -20,17 +21,17 @@ from urllib.parse import unquote
 import numpy as np
 
 from .overview import (
-    not_agreeing, Odd, odd_sensors, OfModel, Overview, rating_of, shared_effects, table_of, Values)
+    not_agreeing, Odd, odd_sensors, OfModel, Overview, rating_of, shared_effects, table_of)
 from .recording import Row
-from .sensors import alike, Store
+from .sensors import alike, read_parquet, Store
 from ..calibration import FleetPrior
 from ..comparison import NAMES
 from ..effects import MODELS, parameter_names
-from ..findings import CROSS, scale_of
+from ..findings import change_words, CROSS, scale_of
 from ..report.sheet import (
-    ACCENT, add_band, AFTER, BAND, BEFORE, Drawing, drawn, EDGE, FAINT, has_matplotlib,
-    legend_below, Mark, Marks, page, THIRD, write_page)
-from ..report.stability import change_words, GROUPS, label_dates, named_words, places_of, spoken
+    ACCENT, add_band, AFTER, BAND, BEFORE, Drawing, drawn, EDGE, FAINT, legend_below, Mark, Marks,
+    page, THIRD, write_page)
+from ..report.stability import GROUPS, label_dates, named_words, places_of
 from ..table import Floats
 from ..text import short, with_minus
 
@@ -58,20 +59,15 @@ _DRIFTS = 0.05
 def write_fleet_page(store: Store, known: Overview, sensors: Sequence[Row],
                      priors: Mapping[str, FleetPrior]) -> None:
     """Write the page of all sensors, with typical values by model; raise OSError if it fails."""
-    differ, drawn_too, odd_names = not_agreeing(sensors), has_matplotlib(), list[str]()
+    differ, odd_names = not_agreeing(sensors), list[str]()
+    drawn_too = find_spec('matplotlib') is not None
     models = []
     for number, (name, own) in enumerate(sorted(
             known.models.items(), key=lambda each: (-len(each[1].values), each[0]))):
-        shown = drawn_too and number < _MOST_MODELS
-        odd, prior = odd_sensors(own.values), priors.get(name)
+        odd = odd_sensors(own.values)
         odd_names += [sensor for sensor, _, _, _ in odd]
-        models.append({
-            'name': name, 'sensors': len(own.values),
-            'odd': [_odd_words(own, each) for each in odd],
-            'values': list(_of_values(f'model{number}_values', own, odd)) if shown else [],
-            'distribution': _distribution(own.values), 'shared': shared_effects(own.values),
-            'drift': list(_of_months(f'model{number}_months', own)) if shown else [],
-            'prior': prior, 'typical': _typical(prior) if prior else []})
+        prefix = f'model{number}' if drawn_too and number < _MOST_MODELS else ''
+        models.append({'name': name, **_section(own, odd, priors.get(name), prefix)})
     drawings, others = _over_time(store, sensors, differ, odd_names) if drawn_too else ([], 0)
     write_page(store.folder / PAGE, page(
         'fleet', 'Fleet', (), rating_of(known, sensors), heading='Calibrations of a fleet',
@@ -82,27 +78,28 @@ def write_fleet_page(store: Store, known: Overview, sensors: Sequence[Row],
         errors=[(row['recording'], row['error'], row['advice']) for row in known.errors]))
 
 
-def _distribution(values: Mapping[str, Values]) -> Sequence[tuple[str, ...]]:
-    """Return the distribution of each value over the sensors."""
-    table = np.array([each.mean for each in values.values()])
-    rows = []
+def _section(known: OfModel, odd: Sequence[Odd], prior: FleetPrior | None, prefix: str
+             ) -> dict[str, Any]:
+    """Return the section of a model of sensor; its figures have names with the prefix, if any."""
+    table = np.array([each.mean for each in known.values.values()])
+    distribution, typical = [], []
     for name, column in zip(NAMES, table.T, strict=True):
         zero, factor, unit = scale_of(name)
         parts = (np.quantile(column, [0.0, 0.1, 0.5, 0.9, 1.0]) - zero) * factor
-        rows.append((f'{spoken(name)} [{unit}]', *(with_minus(short(part)) for part in parts)))
-    return rows
-
-
-def _typical(fleet: FleetPrior) -> Sequence[tuple[str, ...]]:
-    """Return the typical values and spreads."""
-    spread = np.sqrt(np.diag(fleet.prior.covariance))
-    rows = list[tuple[str, ...]]()
-    for name, mean, sd in zip(parameter_names(MODELS['10'].effects), fleet.prior.mean, spread,
-                              strict=True):
-        _, factor, unit = scale_of(name)
-        rows.append((name.replace('.', ' ').replace('_', ' '), with_minus(short(mean * factor)),
-                     short(sd * factor), unit))
-    return rows
+        label = f'{name.replace(".", " ")} [{unit}]'
+        distribution.append((label, *(with_minus(short(part)) for part in parts)))
+    if prior is not None:
+        spread = np.sqrt(np.diag(prior.prior.covariance))
+        for name, mean, sd in zip(parameter_names(MODELS['10'].effects), prior.prior.mean, spread,
+                                  strict=True):
+            _, factor, unit = scale_of(name)
+            typical.append((name.replace('.', ' ').replace('_', ' '),
+                            with_minus(short(mean * factor)), short(sd * factor), unit))
+    return {'sensors': len(known.values), 'odd': [_odd_words(known, each) for each in odd],
+            'values': list(_draw_values(f'{prefix}_values', known, odd)) if prefix else [],
+            'distribution': distribution, 'shared': shared_effects(known.values),
+            'drift': list(_draw_months(f'{prefix}_months', known)) if prefix else [],
+            'prior': prior, 'typical': typical}
 
 
 def _changes(sensors: Sequence[Row]) -> Sequence[tuple[str, ...]]:
@@ -112,8 +109,8 @@ def _changes(sensors: Sequence[Row]) -> Sequence[tuple[str, ...]]:
         sensor, drift = row['sensor'], row.get('drift')
         for change in row['changes']:
             date, path = (change['date'] or '')[:10], change.get('recording') or ''
-            rows.append((sensor, f'{date} {path}'.strip(), _change_words(change),
-                         _LASTING[change['for_good']]))
+            words = change_words(change['parameter'], change['change'], change['sd'])
+            rows.append((sensor, f'{date} {path}'.strip(), words, _LASTING[change['for_good']]))
         if drift and drift['p_value'] < _DRIFTS:
             words = change_words(drift['parameter'], drift['per_year'], drift['sd'])
             rows.append((sensor, '', f'{words} per year', 'drift'))
@@ -136,9 +133,9 @@ def _over_time(store: Store, sensors: Sequence[Row], differ: Sequence[Row],
             (name for name in dict.fromkeys(names) if name in by_name and name not in chosen),
             most))
     significant = {row['sensor'] for row in differ}
-    folders = {unquote(folder): folder for folder in store.sensors()}
-    drawings = [_of_sensor(f'sensor{number}', name, alike(store.of_sensor(folders[name])),
-                           by_name[name]['changes'] if name in significant else [])
+    files = {unquote(folder): store.data(folder) for folder in store.sensors()}
+    drawings = [_draw_sensor(f'sensor{number}', name, alike(read_parquet(files[name])),
+                             by_name[name]['changes'] if name in significant else [])
                 for number, name in enumerate(chosen)]
     return drawings, len(by_name) - len(chosen)
 
@@ -161,7 +158,7 @@ _FEW = 12
 _COLOURS = (AFTER, THIRD, BEFORE)
 
 
-def _of_values(prefix: str, known: OfModel, odd: Sequence[Odd]) -> Iterator[Drawing]:
+def _draw_values(prefix: str, known: OfModel, odd: Sequence[Odd]) -> Iterator[Drawing]:
     """Yield histograms of each value over the sensors of a model, with the odd sensors."""
     table = np.array([each.mean for each in known.values.values()])
     for key, words, names in GROUPS:
@@ -217,7 +214,7 @@ def _short_name(name: str) -> str:
     return name if len(name) <= _LONGEST_NAME else f'…{name[1 - _LONGEST_NAME:]}'
 
 
-def _of_months(prefix: str, known: OfModel) -> Iterator[Drawing]:
+def _draw_months(prefix: str, known: OfModel) -> Iterator[Drawing]:
     """Yield the drift of all sensors of a model together, as bands of quantiles by month."""
     months, found = known.months.quantiles((0.05, 0.25, 0.5, 0.75, 0.95))
     if len(months) < 3:
@@ -238,8 +235,8 @@ def _of_months(prefix: str, known: OfModel) -> Iterator[Drawing]:
                       'month, with bands of 50 % and 90 % of the calibrations', figure)
 
 
-def _of_sensor(name: str, sensor: str, rows: Sequence[Row], changes: Sequence[Mapping[str, Any]]
-               ) -> Drawing:
+def _draw_sensor(name: str, sensor: str, rows: Sequence[Row],
+                 changes: Sequence[Mapping[str, Any]]) -> Drawing:
     """Draw the newest of the dated `rows` of a sensor, with bands and its changes."""
     shown = rows[-_MOST_DATES:]
     places = {row['key']: place for place, row in enumerate(shown)}
@@ -252,8 +249,13 @@ def _of_sensor(name: str, sensor: str, rows: Sequence[Row], changes: Sequence[Ma
     with drawn(0.9 + 1.15 * len(groups), _short_name(sensor), len(groups), sharex=True
                ) as (figure, panels):
         for panel, (key, names) in zip(panels, groups, strict=True):
-            columns = [NAMES.index(name) for name in names]
-            unit = _draw_group(panel, names, at, values[:, columns], deviations[:, columns])
+            for value, label, colour in zip(names, 'xyz', _COLOURS, strict=True):
+                column, (_, factor, unit) = NAMES.index(value), scale_of(value)
+                middle = (values[:, column] - np.median(values[:, column])) * factor
+                band = BAND * deviations[:, column] * factor
+                add_band(panel, at, middle - band, middle + band, colour)
+                panel.plot(at, middle, color=colour, linewidth=1.2, label=label,
+                           marker='o' if len(at) <= _FEW else None, markersize=2.5)
             panel.set_ylabel(f'{key.replace("_", "-")}\n[{unit}]')
             for place, change in marked:
                 panel.axvline(at[place], color=ACCENT, linewidth=1.4, linestyle='-'
@@ -264,26 +266,9 @@ def _of_sensor(name: str, sensor: str, rows: Sequence[Row], changes: Sequence[Ma
             panels[0].plot(along, np.full(len(along), panels[0].get_ylim()[1]), 'v', color=ACCENT,
                            gid='changes', clip_on=False, **EDGE)
             hover['changes'] = tuple(
-                Mark(f'{shown[place]["recording"]}: {_change_words(change)}, '
+                Mark(f'{shown[place]["recording"]}: '
+                     f'{change_words(change["parameter"], change["change"], change["sd"])}, '
                      f'{_LASTING[change["for_good"]]}') for place, change in marked)
         label_dates(panels[-1], at, 'date of the recording', dated=dated)
         legend_below(figure, 3, *panels[0].get_legend_handles_labels())
     return Drawing(name, f'{sensor}: calibrations over time with 95 % band', figure, hover)
-
-
-def _draw_group(panel: Any, names: Sequence[str], at: Floats, values: Floats, deviations: Floats
-                ) -> str:
-    """Draw three values over time, minus their medians, with bands; return their unit."""
-    for k, name in enumerate(names):
-        _, factor, unit = scale_of(name)
-        middle = (values[:, k] - np.median(values[:, k])) * factor
-        band = BAND * deviations[:, k] * factor
-        add_band(panel, at, middle - band, middle + band, _COLOURS[k])
-        panel.plot(at, middle, color=_COLOURS[k], linewidth=1.2, label='xyz'[k],
-                   marker='o' if len(at) <= _FEW else None, markersize=2.5)
-    return unit
-
-
-def _change_words(change: Mapping[str, Any]) -> str:
-    """Return a change with its standard deviation."""
-    return change_words(change['parameter'], change['change'], change['sd'])

@@ -15,11 +15,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 import hashlib
-from itertools import chain
 import json
 import os
 from pathlib import Path, PurePosixPath
@@ -46,6 +45,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 _MAGIC = '*?['
+_METADATA = 'metadata.yaml'
+"""File in the folder of a rosbag2, which is one recording."""
 
 
 @dataclass(frozen=True)
@@ -69,27 +70,23 @@ def recordings(given: Iterable[str]) -> Iterator[Input]:
     or a folder cannot be read.
 
     """
-    for text in chain.from_iterable(map(_stated, given)):
-        found = None
-        for found in _addresses(text) if '://' in text else _local(text):
-            yield found
-        if found is None:
-            raise InputError(f'{text} holds no recording, expected at least one that ends with '
-                             f'{", ".join(SUFFIXES)}',
-                             'correct the name, or put a glob in quotes')
-
-
-def _stated(text: str) -> Iterator[str]:
-    """Yield a name, or those of a list, whose relative names are relative to it."""
-    if not text.startswith('@'):
-        yield text
-        return
-    path = Path(text[1:])
-    check_regular(path)
-    with path.open(encoding='utf-8', errors='surrogateescape') as file:
-        for line in filter(None, map(str.strip, file)):
-            if not line.startswith('#'):
-                yield line if '://' in line else str(path.parent / line)
+    for text in given:
+        names = [text]
+        if text.startswith('@'):
+            path = Path(text[1:])
+            check_regular(path)
+            with path.open(encoding='utf-8', errors='surrogateescape') as file:
+                # Names in a list are relative to it.
+                names = [line if '://' in line else str(path.parent / line)
+                         for line in map(str.strip, file) if line and line[0] != '#']
+        for name in names:
+            found = None
+            for found in _addresses(name) if '://' in name else _local(name):
+                yield found
+            if found is None:
+                raise InputError(f'{name} holds no recording, expected at least one that ends '
+                                 f'with {", ".join(SUFFIXES)}',
+                                 'correct the name, or put a glob in quotes')
 
 
 def _local(text: str) -> Iterator[Input]:
@@ -102,7 +99,7 @@ def _local(text: str) -> Iterator[Input]:
     """
     path = Path(os.path.abspath(text))
     if path.exists():
-        root = path if path.is_dir() and not _is_bag_folder(path) else path.parent
+        root = path if path.is_dir() and not (path / _METADATA).is_file() else path.parent
         found = [path]
     elif any(letter in text for letter in _MAGIC):
         # The folder above the first part with a wildcard.
@@ -118,18 +115,13 @@ def _local(text: str) -> Iterator[Input]:
         if not each.exists() or (place := (each.stat().st_dev, each.stat().st_ino)) in seen:
             continue
         seen.add(place)
-        if each.is_file() or _is_bag_folder(each):
+        if each.is_file() or (each / _METADATA).is_file():
             yield Input(str(each), each.relative_to(root).as_posix())
         elif each.is_dir():
             inside = [part for part in sorted(each.iterdir()) if not part.name.startswith('.')
                       and (part.is_dir() or part.suffix.lower() in SUFFIXES)]
             links.extend(filter(Path.is_symlink, inside))
             waiting.extendleft(part for part in reversed(inside) if not part.is_symlink())
-
-
-def _is_bag_folder(path: Path) -> bool:
-    """Return whether a path is the folder of a rosbag2, which is one recording."""
-    return (path / 'metadata.yaml').is_file()
 
 
 def _addresses(text: str) -> Iterator[Input]:
@@ -275,25 +267,19 @@ def date_of(found: Input, poses: Poses | None, modified_s: float | None) -> tupl
     [s since 1970]. Both texts are empty if it is not known.
 
     """
+    stamp, source = modified_s, 'file'
+    for match in [*_DATE.finditer(found.inside)][-1:]:
+        year, _, month, day, *clock = match.groups()
+        when = f'{year}-{month}-{day}T{":".join(part or "00" for part in clock)}+00:00'
+        with suppress(ValueError):  # such as 30 February
+            stamp, source = datetime.fromisoformat(when).timestamp(), 'path'
     if poses is not None and 'time' in poses and len(poses):
         first = float(poses['time'][0])
         if _FIRST_STAMP <= first < _LAST_STAMP:
-            return _iso(first), 'stamps'
-    matches = list(_DATE.finditer(found.inside))
-    if matches:
-        year, _, month, day, *clock = matches[-1].groups()
-        try:
-            hour, minute, second = (int(part or 0) for part in clock)
-            when = datetime(int(year), int(month), int(day), hour, minute, second,
-                            tzinfo=timezone.utc)
-            return when.isoformat(timespec='seconds'), 'path'
-        except ValueError:  # such as 30 February
-            pass
-    return ('', '') if modified_s is None else (_iso(modified_s), 'file')
-
-
-def _iso(stamp: float) -> str:
-    return datetime.fromtimestamp(stamp, timezone.utc).isoformat(timespec='seconds')
+            stamp, source = first, 'stamps'
+    if stamp is None:
+        return '', ''
+    return datetime.fromtimestamp(stamp, timezone.utc).isoformat(timespec='seconds'), source
 
 
 # ----------------------------------------------------------------------------- rows
@@ -428,7 +414,7 @@ def _figures(intake: Intake, outcome: Outcome) -> Row:
     # Offset and gain at the middle of the context.
     free = rotation_free(calibration, calibration.typical_context(1), calibration.units.per_g)
     variance = np.einsum('tp,pq,tq->t', free.slope, calibration.covariance, free.slope)
-    return {
+    row: Row = {
         'status': 'ok', 'rating': outcome.rating.name, 'rating_reason': outcome.rating.reason,
         'model': calibration.name, 'effects': [*map(str, calibration.model.effects)],
         'refined': outcome.line, 'units': intake.units.name, 'poses': len(calibration.poses),
@@ -440,18 +426,13 @@ def _figures(intake: Intake, outcome: Outcome) -> Row:
             calibration.parameters, calibration.model.vector.tolist(), deviation.tolist(),
             strict=True)],
         **{column: float(value) for k, name in enumerate(NAMES) for column, value in (
-            (name, free.values[k]), (f'{name}.sd', np.sqrt(max(variance[k], 0.0))))},
-        **_for_prior(intake, calibration)}
-
-
-def _for_prior(intake: Intake, found: Calibration) -> Row:
-    """Return values and covariance of model 10, if the poses determine it."""
-    if intake.units.is_native:
-        return {}
-    if found.model.effects != MODELS[_WHOLE_MODEL].effects:
-        try:
-            found = fit_poses(intake.poses, intake.units, model=_WHOLE_MODEL)
-        except RefusedFitError:
-            return {}
-    return {'prior_values': found.model.vector.tolist(),
-            'prior_covariance': found.covariance.ravel().tolist()}
+            (name, free.values[k]), (f'{name}.sd', np.sqrt(max(variance[k], 0.0))))}}
+    if not intake.units.is_native:
+        # Values of model 10 for the prior, if the poses determine it.
+        with suppress(RefusedFitError):
+            whole = calibration
+            if calibration.model.effects != MODELS[_WHOLE_MODEL].effects:
+                whole = fit_poses(intake.poses, intake.units, model=_WHOLE_MODEL)
+            row |= {'prior_values': whole.model.vector.tolist(),
+                    'prior_covariance': whole.covariance.ravel().tolist()}
+    return row

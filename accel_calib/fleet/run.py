@@ -17,6 +17,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -29,8 +30,9 @@ from typing import Any, TYPE_CHECKING, TypeVar
 from .overview import digest_of, overview, priors_of, rating_of
 from .page import write_fleet_page
 from .recording import (
-    as_folder, content_hash, Input, key_of, on_disk, Options, Row, row_of, unread_row)
-from .sensors import is_damaged, merge_sensor, read_parquet, Store, UNREAD, write_sensors
+    as_folder, content_hash, Input, key_of, on_disk, Options, Row, row_of, schema, unread_row)
+from .sensors import (
+    is_damaged, merge_sensor, read_parquet, SENSORS, Store, UNREAD, write_parquet, write_sensors)
 from ..calibration import Calibration, FleetPrior
 from ..disk import write_atomically
 from ..effects import OwnEffect
@@ -155,22 +157,17 @@ def cluster(address: str = '', workers: int | None = None) -> Iterator[Client]:
 
 
 class _CtrlC:
-    """Whether Ctrl-C came, and whether it may interrupt now; one per process, as the signal."""
+    """Whether Ctrl-C came; one per process, as the signal."""
 
-    came = passes = False
+    came = False
 
 
 @contextmanager
 def _ctrl_c_waits() -> Iterator[None]:
-    """Let Ctrl-C wait for `_ctrl_c_passes` or the end: within Dask it leaves half-done calls."""
-    def take(number: int, frame: object) -> None:
-        _CtrlC.came = True
-        if _CtrlC.passes:
-            raise KeyboardInterrupt
-
+    """Let Ctrl-C wait for `mapped` or the end: within Dask it leaves half-done calls."""
     before = signal.getsignal(signal.SIGINT)
     if before != signal.SIG_IGN:
-        signal.signal(signal.SIGINT, take)
+        signal.signal(signal.SIGINT, lambda number, frame: setattr(_CtrlC, 'came', True))
     try:
         yield
     finally:
@@ -178,18 +175,6 @@ def _ctrl_c_waits() -> Iterator[None]:
         if _CtrlC.came:  # whatever else the interruption has caused
             _CtrlC.came = False
             raise KeyboardInterrupt
-
-
-@contextmanager
-def _ctrl_c_passes() -> Iterator[None]:
-    """Let Ctrl-C interrupt the block."""
-    _CtrlC.passes = True
-    try:
-        if _CtrlC.came:
-            raise KeyboardInterrupt
-        yield
-    finally:
-        _CtrlC.passes = False
 
 
 def run(client: Client, found: Sequence[Input], options: Options, store: Store,
@@ -234,7 +219,8 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         store.forget_lost()
         _merge(client, store, options.own)  # what an interrupted run left
         counts, unread = Counter[str](), list[Row]()
-        for item, status in mapped(client, calibrate_recording, found, options, store, limit_s):
+        calibrate = partial(calibrate_recording, limit_s=limit_s)
+        for item, status in mapped(client, calibrate, found, options, store):
             if isinstance(status, Exception):  # not of the recording, unless workers died
                 if not isinstance(status, KilledWorker):
                     raise status
@@ -246,7 +232,8 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
                 status = 'unread'
             counts[status] += 1
             progress(sum(counts.values()), len(found))
-        store.replace_unread(unread)
+        if unread or store.data(UNREAD).exists():
+            write_parquet(store.data(UNREAD), unread, schema())
         sensors = tuple(_merge(client, store, options.own))
         known = overview(_in_order(client, digest_of, [*store.sensors(), UNREAD], store))
         priors, path = priors_of(known.typical), store.folder / PRIOR_FILE
@@ -261,10 +248,10 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
 def _merge(client: Client, store: Store, own: tuple[OwnEffect, ...]) -> list[Row]:
     """Merge all pending rows, and compare the calibrations; return the rows of all sensors."""
     names = store.waiting()
-    if not store.sensors_file.exists():
+    if not (store.folder / SENSORS).exists():
         names = sorted({*names, *store.sensors()})
     if not names:
-        return read_parquet(store.sensors_file)
+        return read_parquet(store.folder / SENSORS)
     found = write_sensors(store, list(_in_order(client, merge_sensor, names, store, own)))
     for _ in _in_order(client, store.finish, names):
         pass
@@ -297,7 +284,7 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
     rest, suspects = iter(items), list[_Item]()
     size, mean_s = 1, _TASK_S  # number of items per task, and the mean duration of an item [s]
     waiting: dict[Any, list[_Item]] = {}
-    done, workers = as_completed(loop=client.loop), _Workers(client)
+    done, workers = as_completed(loop=client.loop), _Workers(client.cluster, time.monotonic())
     limit = _AHEAD * max(sum(client.nthreads().values()), 1)
     alone = False
     while True:
@@ -311,11 +298,12 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
             done.add(future)
         if not waiting:
             return
-        with _ctrl_c_passes():
-            while not done.has_ready():
-                time.sleep(_LOOK_S)
-                workers.look()
-            future = next(done)
+        while not done.has_ready() and not _CtrlC.came:
+            time.sleep(_LOOK_S)
+            workers.look()
+        if _CtrlC.came:
+            raise KeyboardInterrupt
+        future = next(done)
         batch = waiting.pop(future)
         try:
             results, seconds = _result_of(client, future, workers)
@@ -330,6 +318,7 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
         yield from zip(batch, results, strict=True)
 
 
+@dataclass
 class _Workers:
     """
     Starts a worker of a cluster of this machine if none has been there for some time.
@@ -338,17 +327,16 @@ class _Workers:
 
     """
 
-    def __init__(self, client: Client) -> None:
-        self._cluster = client.cluster
-        self._seen = time.monotonic()
+    cluster: Any
+    seen: float
 
     def look(self) -> None:
         now = time.monotonic()
-        if self._cluster is None or self._cluster.scheduler.workers:
-            self._seen = now
-        elif now - self._seen > _ABSENT_S:
-            self._seen = now
-            self._cluster.scale(len(self._cluster.workers) + 1)
+        if self.cluster is None or self.cluster.scheduler.workers:
+            self.seen = now
+        elif now - self.seen > _ABSENT_S:
+            self.seen = now
+            self.cluster.scale(len(self.cluster.workers) + 1)
 
 
 def _result_of(client: Client, future: Any, workers: _Workers) -> tuple[list[Any], float]:
@@ -404,19 +392,16 @@ def calibrate_recording(found: Input, options: Options, store: Store, limit_s: f
     `limit_s` [s], or ends in any other error. OSError is raised if the result cannot be written.
 
     """
-    begin = time.perf_counter()
+    begin, row = time.perf_counter(), Row()
     try:
         with on_disk(found.path) as path:
             content = content_hash(path)
             key = key_of(content, found, options)
-            if store.has(key):
+            if store.mark(key).exists():
                 return 'skipped'
             row, calibration = _apart.process.call(
                 row_of, found, path, options, limit_s=limit_s)
-    except Exception as err:  # one recording must not stop the others
-        return unread_row(found, options, _reason(err, found.path, limit_s))
-    row |= {'key': key, 'content': content, 'seconds': time.perf_counter() - begin}
-    try:
+        row |= {'key': key, 'content': content, 'seconds': time.perf_counter() - begin}
         if calibration is not None:
             name = f'calibrations/{as_folder(row["sensor"])}/{key}.yaml'
             (store.folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -424,19 +409,15 @@ def calibrate_recording(found: Input, options: Options, store: Store, limit_s: f
             row['calibration'] = name
             row['warnings'] += _exported(calibration, store.folder / name, options.exports)
         store.add(row)
-    except OSError:
-        raise
-    except Exception as err:
-        return unread_row(found, options, _reason(err, found.path, limit_s))
-    return str(row['status'])
-
-
-def _reason(error: Exception, name: str, limit_s: float) -> AccelCalibError:
-    """Return why a recording could not be read."""
-    if isinstance(error, TimeoutError):
-        return InputError(f'{name} takes longer than {limit_s:g} s, expected less',
-                          'raise --time-limit, or leave it out')
-    return known_error(OSError(str(error)) if isinstance(error, EOFError) else error)
+        return str(row['status'])
+    except Exception as err:  # one recording must not stop the others
+        if row and isinstance(err, OSError):
+            raise
+        error = known_error(OSError(str(err)) if isinstance(err, EOFError) else err)
+        if isinstance(err, TimeoutError):
+            error = InputError(f'{found.path} takes longer than {limit_s:g} s, expected less',
+                               'raise --time-limit, or leave it out')
+        return unread_row(found, options, error)
 
 
 def _exported(calibration: Calibration, path: Path, formats: Sequence[str]) -> list[str]:

@@ -62,9 +62,11 @@ UNREAD = '~unread'
 """Folder of the rows of recordings that could not be read; no sensor has this folder."""
 
 _DATA = 'data.parquet'
-_SENSORS = 'sensors.parquet'
+SENSORS = 'sensors.parquet'
+"""File of the rows of all sensors."""
+
 _NEEDED: dict[str, tuple[str, ...]] = {
-    _SENSORS: ('sensor',), _DATA: ('key', 'content', 'recording', 'date', 'status')}
+    SENSORS: ('sensor',), _DATA: ('key', 'content', 'recording', 'date', 'status')}
 """Columns without which a row is damaged, by the name of the file."""
 
 
@@ -80,18 +82,9 @@ class Store:
 
     folder: Path
 
-    @property
-    def sensors_file(self) -> Path:
-        """Return the file of the rows of all sensors."""
-        return self.folder / _SENSORS
-
     def data(self, name: str) -> Path:
         """Return the Parquet file of a sensor, by the name of its folder."""
         return self.folder / 'recordings' / f'sensor={name}' / _DATA
-
-    def has(self, key: str) -> bool:
-        """Return whether the result with this key is in the data set."""
-        return self._mark(key).exists()
 
     def add(self, row: Row) -> None:
         """
@@ -124,16 +117,16 @@ class Store:
         folder = self.folder / 'pending' / name
         paths = sorted(folder.glob('*.json'), key=lambda path: path.stat().st_mtime)
         new = [_pending_row(path) for path in paths]
-        old, newest = self.of_sensor(name), {row['content']: row for row in new}
+        old, newest = read_parquet(self.data(name)), {row['content']: row for row in new}
         if new:
             kept = [row for row in old if row['content'] not in newest]
             write_parquet(self.data(name), sorted((*kept, *newest.values()), key=lambda row: (
                 row['date'] or '', row['recording'])), schema())
         for row in (*old, *new):
             if newest.get(row['content'], row)['key'] != row['key']:
-                self._mark(row['key']).unlink(missing_ok=True)
+                self.mark(row['key']).unlink(missing_ok=True)
         for row in new:
-            mark = self._mark(row['key'])
+            mark = self.mark(row['key'])
             mark.parent.mkdir(parents=True, exist_ok=True)
             mark.write_text(f'{name}\n{row.get("calibration", "")}', encoding='utf-8')
 
@@ -143,14 +136,14 @@ class Store:
         if not folder.exists():
             return
         for path in folder.iterdir():  # with temporary files of killed workers
-            if path.suffix != '.json' or self.has(path.stem):
+            if path.suffix != '.json' or self.mark(path.stem).exists():
                 path.unlink(missing_ok=True)
         if not any(folder.iterdir()):  # a worker of a killed program may still write
             folder.rmdir()
 
     def files(self) -> Iterator[Path]:
         """Yield all files with rows."""
-        for pattern in (_SENSORS, f'recordings/*/{_DATA}', 'pending/*/*.json'):
+        for pattern in (SENSORS, f'recordings/*/{_DATA}', 'pending/*/*.json'):
             yield from sorted(self.folder.glob(pattern))
 
     def set_aside(self, path: Path) -> Path:
@@ -169,11 +162,6 @@ class Store:
             if name not in known or not (self.folder / os.fsdecode(calibration)).exists():
                 mark.unlink()
 
-    def replace_unread(self, rows: list[Row]) -> None:
-        """Replace the rows of the recordings that could not be read."""
-        if rows or self.data(UNREAD).exists():
-            write_parquet(self.data(UNREAD), rows, schema())
-
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Make the folder, and hold it for this program; raise InputError if another has it."""
@@ -188,16 +176,13 @@ class Store:
                                  'wait for it, or choose another folder') from err
             yield
 
-    def of_sensor(self, name: str, columns: Sequence[str] | None = None) -> list[Row]:
-        """Return the rows of a sensor by the name of its folder, with all columns or these."""
-        return read_parquet(self.data(name), columns)
-
     def sensors(self) -> list[str]:
         """Return the folders of all sensors in the data set, in order."""
         names = (each.name.partition('=')[2] for each in self.folder.glob('recordings/sensor=*'))
         return sorted(name for name in names if name != UNREAD)
 
-    def _mark(self, key: str) -> Path:
+    def mark(self, key: str) -> Path:
+        """Return the file that is there if the result with this key is in the data set."""
         return self.folder / 'done' / key[:2] / key
 
 
@@ -277,14 +262,10 @@ def alike(rows: Iterable[Row]) -> list[Row]:
 
     """
     good = [row for row in rows if row['calibration'] and row['determined']]
-    most = next((kind for kind, _ in Counter(map(_kind, good)).most_common(1)), None)
-    return [row for row in good if _kind(row) == most]
-
-
-def _kind(row: Row) -> frozenset[str]:
-    """Return the effects of a calibration; none if it has only those of models 4, 7 and 10."""
-    effects = frozenset(row['effects'])
-    return effects if effects - {*LADDER} else frozenset()
+    effects = [frozenset(row['effects']) for row in good]
+    kinds = [each if each - {*LADDER} else frozenset() for each in effects]
+    most = [kind for kind, _ in Counter(kinds).most_common(1)]
+    return [row for row, kind in zip(good, kinds, strict=True) if kind in most]
 
 
 def sensors_schema() -> pa.Schema:
@@ -317,7 +298,7 @@ def merge_sensor(name: str, store: Store, own: tuple[OwnEffect, ...] = ()) -> Ro
 
     """
     store.merge(name)
-    rows = store.of_sensor(name)
+    rows = read_parquet(store.data(name))
     sensor = unquote(name)
     good = alike(rows)[-_MOST_COMPARED:] if sensor != UNKNOWN else []
     about: Row = {**dict.fromkeys(sensors_schema().names), 'sensor': sensor,
@@ -347,15 +328,20 @@ def _compared(calibrations: Sequence[Calibration], rows: Sequence[Row]) -> Row:
     limit, back = LEVEL / len(history.changes), False
     changes: list[Row] = []
     lasting: dict[int, bool | None] = {}
-    steady = _Steady.of(history)
+    years, rates = years_of(history), np.zeros(len(history.parameters))
+    at = np.arange(float(len(history.moments))) if years is None else years
+    steps = np.diff(at)
+    if len(steps) >= _FEWEST_STEPS and np.all(steps > 0.0):
+        rates = np.median([np.diff(each.values) for each in history.parameters] / steps, axis=1)
     for k, change in enumerate(history.changes):
-        most = steady.changed(k, k + 1, limit)
+        most = _most_changed(history, k, k + 1, rates * steps[k], limit)
         if back or most is None or change.comparison.p_value >= limit:
             back = False  # no change, or from the odd one back to the others
             continue
         for_good = None  # the calibration after the newest one is not there yet
         if k + 2 < len(history.moments):
-            for_good = (steady.changed(k, k + 2, limit) is not None
+            drift = rates * (at[k + 2] - at[k])
+            for_good = (_most_changed(history, k, k + 2, drift, limit) is not None
                         and history.between(k, k + 2).p_value < limit)
         lasting[k + 1] = for_good
         back = for_good is False
@@ -368,42 +354,21 @@ def _compared(calibrations: Sequence[Calibration], rows: Sequence[Row]) -> Row:
     return {**found, 'changes': changes, 'drift': drift_of(history, lasting)}
 
 
-@dataclass(frozen=True)
-class _Steady:
+def _most_changed(history: History, one: int, other: int, drift: Floats, limit: float
+                  ) -> Parameter | None:
     """
-    The calibrations of a sensor, and the steady drift of their values.
+    Return the value that changed most between two calibrations; None if none did.
 
-    `at` are the (n,) times of the calibrations [year], or their numbers without dates. `rates` are
-    the (t,) median changes per unit of `at`; 0 with fewer than `_FEWEST_STEPS` steps.
+    The (t,) changes by the steady drift of the values are subtracted.
 
     """
-
-    history: History
-    at: Floats
-    rates: Floats
-
-    @classmethod
-    def of(cls, history: History) -> _Steady:
-        """Return a history with its drift."""
-        years = years_of(history)
-        at = np.arange(float(len(history.moments))) if years is None else years
-        steps = np.diff(at)
-        rates = np.zeros(len(history.parameters))
-        if len(steps) >= _FEWEST_STEPS and np.all(steps > 0.0):
-            rates = np.median([np.diff(each.values) for each in history.parameters] / steps,
-                              axis=1)
-        return cls(history, at, rates)
-
-    def changed(self, one: int, other: int, limit: float) -> Parameter | None:
-        """Return the value that changed most between two calibrations; None if none did."""
-        values = self.history.parameters
-        away = np.array([each.values[other] - each.values[one] for each in values])
-        away -= self.rates * (self.at[other] - self.at[one])
-        sd = np.array([np.hypot(each.stated_sd[one], each.stated_sd[other]) for each in values])
-        far = np.divide(np.abs(away), sd, out=np.zeros(len(sd)), where=sd > 0.0)
-        most = int(np.argmax(far))
-        least = -scipy.special.ndtri(limit / (2.0 * len(far)))
-        return values[most] if far[most] > least else None
+    values = history.parameters
+    away = np.array([each.values[other] - each.values[one] for each in values]) - drift
+    sd = np.array([np.hypot(each.stated_sd[one], each.stated_sd[other]) for each in values])
+    far = np.divide(np.abs(away), sd, out=np.zeros(len(sd)), where=sd > 0.0)
+    most = int(np.argmax(far))
+    least = -scipy.special.ndtri(limit / (2.0 * len(far)))
+    return values[most] if far[most] > least else None
 
 
 def years_of(history: History) -> Floats | None:
@@ -452,7 +417,8 @@ def drift_of(history: History, changes: Mapping[int, bool | None] = {}) -> Row |
 
 def write_sensors(store: Store, rows: Sequence[Row]) -> list[Row]:
     """Add or replace the rows of sensors, and return the rows of all of them."""
-    known = {row['sensor']: row for row in (*read_parquet(store.sensors_file), *rows)}
+    path = store.folder / SENSORS
+    known = {row['sensor']: row for row in (*read_parquet(path), *rows)}
     found = [known[name] for name in sorted(known)]
-    write_parquet(store.sensors_file, found, sensors_schema())
+    write_parquet(path, found, sensors_schema())
     return found

@@ -24,8 +24,8 @@ from ..findings import angle_words, rate, residual_figures
 from ..messages.one_reading import Triple
 from ..report import calibration_page, STORED
 from ..session import (
-    Answer, APART, CallSoon, Compute, conditions, enable, Event, Log, progress, Result, run,
-    Session, Severity, ShowPoses, State, Task, title, words_of_state, Worker)
+    Answer, APART, CallSoon, Compute, conditions, Event, Log, progress, Result, run, Session,
+    ShowPoses, Task, title, words_of_state, Worker)
 from ..stored.exports import export
 
 Show = Callable[[Message], object]
@@ -58,7 +58,7 @@ class Exchange:
         self.problem = ''
         self._shown: Calibration | None = None
         self._number = 0
-        self._drawing: tuple[int, Future[tuple[bool, str]]] = -1, Future()
+        self._page: Future[tuple[bool, str]] | None = None
         self._line = int(time()) * 1000  # a viewer of an earlier server has smaller numbers
 
     # The session has news
@@ -72,25 +72,56 @@ class Exchange:
         """Show a log line, or the poses; and the state where it may have changed."""
         if isinstance(event, Log):
             self._line += 1
-            self.show(log_line(self._line, event.severity, event.words, time()))
+            self.show({'kind': 'log', 'number': self._line, 'severity': event.severity,
+                       'words': event.words, 'time': round(time(), 3)})  # since 1970 [s]
         elif isinstance(event, ShowPoses):
             self.show({'kind': 'poses', 'up': event.up})
         if isinstance(event, ShowPoses | Result):
             self.show_state()
 
     def show_state(self) -> None:
-        """Show the state; the server sends it only if it has changed."""
-        session = self._session
-        if session.sensor.present is not self._shown:
-            self._shown = session.sensor.present
-            self._number += 1
-        busy = next(iter(self._worker.running), '')
-        self.show(_state(session.state, self.problem, busy=busy, page=self._number))
+        """
+        Show the state, with the offered calibration, or otherwise the one in use.
+
+        Without a `problem`, it has the most severe finding, other than that there is no
+        calibration yet. The server sends it only if it has changed.
+
+        """
+        state, sensor = self._session.state, self._session.sensor
+        in_use, shown, rating = sensor.calibration, sensor.present, sensor.rating
+        if shown is not self._shown:
+            self._shown, self._page, self._number = shown, None, self._number + 1
+        found = [each for each in conditions(state) if each.level == 'BAD' or (
+            each.level == 'USABLE' and each.kind not in APART)]
+        worst = max(found, key=lambda each: LEVELS.index(each.level), default=None)
+        self.show({
+            'kind': 'state', 'sensor': state.name, 'source': state.topic,
+            'state': words_of_state(state),
+            'problem': self.problem or (worst.text if worst else ''),
+            'calibration': '' if in_use is None else title(in_use),
+            'preview': sensor.offered is not None,
+            'levelled': shown is not None and shown.is_levelled,
+            'mounting': '' if shown is None or not shown.is_levelled else (
+                f'the sensor is mounted with {angle_words(shown.rotation)}'),
+            'file': state.files.path, 'busy': next(iter(self._worker.running), ''),
+            'counts_per_g': None if shown is None or not shown.units.is_native else np.mean(
+                np.linalg.norm(shown.gain, axis=0)),
+            'rating': None if shown is None or rating is None else {
+                'rating': rating.name, 'reason': rating.reason},
+            'result': None if shown is None else {
+                'unit': shown.units.name, 'poses': len(shown.used_poses),
+                'left_out': len(shown.poses) - len(shown.used_poses),
+                'coverage': shown.quality.coverage,
+                'residuals': [(figure.label, figure.value, figure.unit)
+                              for figure in residual_figures(shown.quality)],
+                'effects': [*map(str, shown.model.effects)], 'warnings': shown.warnings,
+                'offset': shown.offset, 'gain': np.diag(shown.gain)},
+            'page': '' if shown is None else f'/calibration.html?{self._number}'})
 
     # The page asks
 
     def ask(self, name: str, answer: Answer) -> None:
-        """Run a command of `viewer.COMMANDS`, and call `answer`."""
+        """Run one of `BUTTONS`, and call `answer`."""
         if name in self._worker.running:
             answer(False, f'{name} is still running; wait for its answer')
             return
@@ -99,14 +130,9 @@ class Exchange:
             self.show_state()  # a viewer knows what has changed when the answer comes
             answer(success, words)
 
-        self._worker.do(name, self._command(name), done)
+        self._worker.do(name, run(self._session, name, offers=True), done)
         if self._worker.running:
             self.show_state()
-
-    def _command(self, name: str) -> Task:
-        if name in ('enable', 'disable'):
-            return enable(self._session, name == 'enable')
-        return (yield from run(self._session, name, offers=True))
 
     def page(self, answer: Answer) -> None:
         """Call `answer` with the calibration page, which is drawn once, or why there is none."""
@@ -114,17 +140,17 @@ class Exchange:
         if self._shown is None:
             answer(False, str(_NO_CALIBRATION))
             return
-        number, page = self._drawing
-        if number != self._number or (page.done() and not page.result()[0]):
-            page = Future()
-            self._drawing, store = (self._number, page), self._session.state.files.store
-            self._worker.run(
-                self._drawn(self._shown, store.calibration.name if store else STORED),
-                lambda *found: page.set_result(found))
+        page = self._page
+        if page is None or (page.done() and not page.result()[0]):
+            page = self._page = Future()
+            self._worker.run(self._drawn(self._shown), lambda *found: page.set_result(found))
         page.add_done_callback(lambda done: answer(*done.result()))
 
-    def _drawn(self, calibration: Calibration, stored: str) -> Task:
-        return (yield Compute(drawn, calibration, self._session.state.topic, stored))
+    def _drawn(self, calibration: Calibration) -> Task:
+        state = self._session.state
+        stored = state.files.store.calibration.name if state.files.store else STORED
+        return (yield Compute(calibration_page, calibration, Compute(rate, calibration),
+                              state.topic, stored=stored))
 
     def export(self, name: str, answer: Answer) -> None:
         """Call `answer` with an export of the calibration in use, or why there is none."""
@@ -137,52 +163,3 @@ class Exchange:
         if sensor.calibration is None:
             raise _NO_CALIBRATION
         return (yield Compute(export, sensor.calibration, name))
-
-
-def drawn(calibration: Calibration, source: str, stored: str) -> str:
-    """Return the page of a calibration; `stored` is the name of its file."""
-    return calibration_page(calibration, rate(calibration), source, stored=stored)
-
-
-def log_line(number: int, severity: Severity, words: str, time: float) -> Message:
-    """Return a log line with its number; `time` is that since 1970 [s]."""
-    return {'kind': 'log', 'number': number, 'severity': severity, 'words': words,
-            'time': round(time, 3)}
-
-
-def _state(state: State, problem: str, *, busy: str, page: int) -> Message:
-    """
-    Return the state for the page, with the calibration that is offered, or else the one in use.
-
-    `problem` may be empty: then the most severe finding is shown, other than that there is no
-    calibration yet. `busy` is the name of the command that runs, and `page` the number of the
-    calibration page.
-
-    """
-    sensor = state.sensor
-    in_use, shown, rating = sensor.calibration, sensor.present, sensor.rating
-    found = [each for each in conditions(state) if each.level == 'BAD' or (
-        each.level == 'USABLE' and each.kind not in APART)]
-    worst = max(found, key=lambda each: LEVELS.index(each.level), default=None)
-    return {
-        'kind': 'state', 'sensor': state.name, 'source': state.topic,
-        'state': words_of_state(state), 'problem': problem or (worst.text if worst else ''),
-        'calibration': '' if in_use is None else title(in_use),
-        'preview': sensor.offered is not None,
-        'levelled': shown is not None and shown.is_levelled,
-        'mounting': '' if shown is None or not shown.is_levelled else (
-            f'the sensor is mounted with {angle_words(shown.rotation)}'),
-        'file': state.files.path, 'busy': busy,
-        'counts_per_g': None if shown is None or not shown.units.is_native else np.mean(
-            np.linalg.norm(shown.gain, axis=0)),
-        'rating': None if shown is None or rating is None else {
-            'rating': rating.name, 'reason': rating.reason},
-        'result': None if shown is None else {
-            'unit': shown.units.name, 'poses': len(shown.used_poses),
-            'left_out': len(shown.poses) - len(shown.used_poses),
-            'coverage': shown.quality.coverage,
-            'residuals': [(figure.label, figure.value, figure.unit)
-                          for figure in residual_figures(shown.quality)],
-            'effects': [*map(str, shown.model.effects)], 'warnings': shown.warnings,
-            'offset': shown.offset, 'gain': np.diag(shown.gain)},
-        'page': '' if shown is None else f'/calibration.html?{page}'}

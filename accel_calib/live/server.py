@@ -47,7 +47,7 @@ from ..stored.exports import FORMATS
 from ..text import plain
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable
 
 _REQUEST_S = 10.0
 """Time within which a connection must send its request [s]."""
@@ -84,41 +84,6 @@ _WRONG_TOKEN = 'the token of this link is of another start of the program, so it
                f'{_ITS_LINK}'
 
 
-class Address:
-    """The port, names and versions of IP by which a browser may call what listens on sockets."""
-
-    def __init__(self, sockets: Iterable[socket.socket]) -> None:
-        bound = [each.getsockname() for each in sockets]
-        own = socket.gethostname().lower()
-        names = {own, own.split('.')[0]}
-        self.port: int = bound[0][1]
-        self._hosts = {'localhost', *names, *(f'{name}.local' for name in names)}
-        self._versions = {ip_address(each[0].split('%')[0]).version for each in bound}
-
-    def refusal(self, request: web.BaseRequest) -> str:
-        """Return why a request is refused by its Host or Origin; empty if it is not."""
-        hosts, origins = (request.headers.getall(name, []) for name in ('Host', 'Origin'))
-        if len(hosts) != 1 or not self._is_own(hosts[0]):
-            return 'the header Host is not an address of this server; open its own link'
-        if origins and [each.lower() for each in origins] != [f'http://{hosts[0].lower()}']:
-            return 'the header Origin is of another site; open the link of this server'
-        return ''
-
-    def _is_own(self, host: str) -> bool:
-        """Return whether a Host is an address of this server, with its port."""
-        try:
-            parts = urlsplit(f'//{host}')
-            name, port = (parts.hostname or '').removesuffix('.'), parts.port or 80
-        except ValueError:
-            return False
-        if port != self.port or '@' in host or parts.path or parts.query or parts.fragment:
-            return False
-        try:
-            return ip_address(name).version in self._versions
-        except ValueError:
-            return name in self._hosts
-
-
 class Connection(web.RequestHandler):
     """
     A connection from an `address`.
@@ -133,11 +98,19 @@ class Connection(web.RequestHandler):
         self._owner, self.stage, self.address = server, 0, ''
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Close the connection later, unless its request arrives."""
+        """Close the connection later, unless its request arrives; at the limit, another one."""
         super().connection_made(transport)
         self.address = str((transport.get_extra_info('peername') or [''])[0])
         self._limit = asyncio.get_running_loop().call_later(_REQUEST_S, self.abort, 0)
-        self._owner.add(self)
+        everyone = self._owner.connections
+        if len(everyone) >= _CONNECTIONS:
+            self._owner.report(f'ended a connection, because {_CONNECTIONS} were open')
+            of = Counter(each.address for each in everyone)
+            ended = max(everyone, key=lambda each: (
+                each.stage < OWNER, of[each.address], -each.stage))
+            del everyone[ended]
+            ended.abort()
+        everyone[self] = None
 
     def connection_lost(self, exc: BaseException | None) -> None:
         """Forget the connection."""
@@ -258,7 +231,7 @@ class PageServer:
     # In the thread of the server
 
     async def _serve(self, started: Future[None]) -> None:
-        """Serve until `close` is called."""
+        """Serve until `close` is called: show the newest progress, and close stuck viewers."""
         self._loop = loop = asyncio.get_running_loop()
         loop.set_exception_handler(self._on_error)
         http = web.Server(self._answer)
@@ -268,11 +241,22 @@ class PageServer:
         except Exception as error:  # `start` raises it, in its own thread
             started.set_exception(error)
             return
-        self._address = Address(listener.sockets)
-        self._port = self._address.port
+        bound, own = [each.getsockname() for each in listener.sockets], (
+            socket.gethostname().lower())
+        names = {own, own.split('.')[0]}
+        # By these names and versions of IP a browser may call.
+        self._hosts = {'localhost', *names, *(f'{name}.local' for name in names)}
+        self._versions = {ip_address(each[0].split('%')[0]).version for each in bound}
+        self._port = bound[0][1]
         started.set_result(None)
         while not self._over.is_set():
-            await self._look()
+            if self.viewers and self.board.history:
+                self._take(self.board.history[-1])
+            for viewer in list(self.viewers):
+                if loop.time() - viewer.sending_since > STUCK_S:
+                    viewer.abort()
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._over.wait(), PERIOD if self.viewers else _RARELY_S)
         listener.close()
         for connection in list(self.connections):
             if connection.stage > 1:
@@ -287,17 +271,6 @@ class PageServer:
         else:
             loop.default_exception_handler(context)
 
-    def add(self, connection: Connection) -> None:
-        """Add a connection; at the limit, end another one."""
-        if len(self.connections) >= _CONNECTIONS:
-            self.report(f'ended a connection, because {_CONNECTIONS} were open')
-            of = Counter(each.address for each in self.connections)
-            ended = max(self.connections, key=lambda each: (
-                each.stage < OWNER, of[each.address], -each.stage))
-            del self.connections[ended]
-            ended.abort()
-        self.connections[connection] = None
-
     def report(self, what: str) -> None:
         """Count what the page had to do, and log it at most once in `_QUIET_S`."""
         self._reported[what] += 1
@@ -305,21 +278,17 @@ class PageServer:
             words = f'the live page {what} ({self._reported[what]} so far)'
             self._exchange.call_soon(lambda: self._exchange.log('warning', words))
 
-    async def _look(self) -> None:
-        """Show the newest progress, close stuck viewers, and wait."""
-        if self.viewers and self.board.history:
-            self._take(self.board.history[-1])
-        now = asyncio.get_running_loop().time()
-        for viewer in list(self.viewers):
-            if now - viewer.sending_since > STUCK_S:
-                viewer.abort()
-        with suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(self._over.wait(), PERIOD if self.viewers else _RARELY_S)
-
     def _take(self, message: Message) -> None:
-        if self.board.take(message):
-            for viewer in self.viewers:
-                viewer.news.set()
+        """Show a message, unless the newest one of its kind is equal."""
+        kind, newest = message['kind'], self.board.newest
+        if kind == 'log':
+            self.board.lines.append(message)
+        elif message == newest.get(kind):
+            return
+        else:
+            newest[kind] = message
+        for viewer in self.viewers:
+            viewer.news.set()
 
     def _is_token(self, given: str) -> bool:
         return hmac.compare_digest(given.encode(errors='replace'), self.token.encode())
@@ -327,7 +296,18 @@ class PageServer:
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
         connection = cast('Connection', request.protocol)
         connection.stage = 1
-        refusal = self._address.refusal(request)
+        hosts, origins = (request.headers.getall(name, []) for name in ('Host', 'Origin'))
+        host, is_own, refusal = hosts[0] if len(hosts) == 1 else '', False, ''
+        with suppress(ValueError):  # the Host cannot be parsed
+            parts = urlsplit(f'//{host}')
+            name, port = (parts.hostname or '').removesuffix('.'), parts.port or 80
+            is_own = name in self._hosts or ip_address(name).version in self._versions
+            is_own &= port == self._port and not (
+                '@' in host or parts.path or parts.query or parts.fragment)
+        if not is_own:
+            refusal = 'the header Host is not an address of this server; open its own link'
+        elif origins and [each.lower() for each in origins] != [f'http://{host.lower()}']:
+            refusal = 'the header Origin is of another site; open the link of this server'
         if refusal:
             return secured(web.Response(status=403, text=f'{refusal}\n'))
         path = request.rel_url.raw_path if request.method == 'GET' else ''
@@ -339,7 +319,7 @@ class PageServer:
         """Return a file of the page, the calibration page, or an export."""
         export = path.removeprefix('/export/')
         if path == '/calibration.html':
-            success, text = await self._asked(self._exchange.page)
+            success, text = await self._ask(self._exchange.page)
             if not success:
                 return web.Response(status=404, text=f'{text}\n')
             allowed = {'Content-Security-Policy': f"{policy()}; frame-ancestors 'self'"}
@@ -354,23 +334,19 @@ class PageServer:
         if kind.lower() != 'bearer' or not self._is_token(token.strip()):
             return web.Response(status=401, headers={'WWW-Authenticate': 'Bearer'}, text=(
                 f'the token is missing or wrong; {_ITS_LINK}\n'))
-        _, found = await self._asked(partial(self._exchange.export, export))
+        _, found = await self._ask(partial(self._exchange.export, export))
         if isinstance(found, str):
             return web.Response(status=409, text=f'{found}\n')
         return web.Response(
             body=found.data, content_type='application/octet-stream',
             headers={'Content-Disposition': f'attachment; filename="calibration{found.suffix}"'})
 
-    async def _asked(self, ask: Callable[[Answer], object]) -> Any:
+    async def _ask(self, ask: Callable[[Answer], object]) -> Any:
         """Return success and answer of a function of the exchange."""
-        answered: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-
-        def take(*found: Any) -> None:
-            if not answered.done():
-                answered.set_result(found)
-
-        self._exchange.call_soon(lambda: ask(lambda *found: self._call(lambda: take(*found))))
-        return await answered
+        answered: Future[Any] = Future()
+        answered.set_running_or_notify_cancel()  # its answer comes even if nobody waits any more
+        self._exchange.call_soon(lambda: ask(lambda *found: answered.set_result(found)))
+        return await asyncio.wrap_future(answered)
 
     async def _stream(self, request: web.BaseRequest, connection: Connection
                       ) -> web.StreamResponse:
@@ -385,7 +361,8 @@ class PageServer:
             return secured(web.Response(status=400, text='expected a WebSocket; open /\n'))
         await socket_.prepare(request)
         connection.stage = 2
-        viewer = Viewer(self.board, socket_, connection.abort, self._ask)
+        viewer = Viewer(self.board, socket_, connection.abort,
+                        lambda command: self._ask(partial(self._exchange.ask, command)))
         try:
             await viewer.run(partial(self._admit, connection))
         finally:
@@ -411,8 +388,3 @@ class PageServer:
         if not viewer.why:
             connection.stage = OWNER
         self.viewers[viewer] = connection
-
-    def _ask(self, command: str, answer: Callable[[bool, str], None]) -> None:
-        """Ask the exchange, and call `answer` in this thread."""
-        self._exchange.call_soon(lambda: self._exchange.ask(
-            command, lambda success, words: self._call(lambda: answer(success, words))))

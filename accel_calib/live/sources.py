@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import chain
+import math
 from pathlib import Path
 import time
 from typing import Any
@@ -114,16 +115,18 @@ def open_source(name: str, options: LogOptions, *, baud: int, speed: float = 1.0
 
     """
     if is_port(name):
-        with closing(_Port(name, baud)) as port:
-            reader = _understood(name, port.lines(), options, baud)
+        port = _Port()
+        with closing(port.lines(name, baud)) as arriving:
+            reader = _understood(name, arriving, options, baud)
             first = [] if reader.first is None else [_rows(reader.first)]
-            blocks = (rows for lines in port.lines() for rows in _rows_of(reader, lines))
-            yield Source(name, '', reader.units, reader.read_as, _in_order(chain(first, blocks)),
-                         reader.findings, lambda: port.problem)
+            blocks = (rows for lines in arriving for rows in _rows_of(reader, lines))
+            yield Source(name, sensor='', units=reader.units, read_as=reader.read_as,
+                         blocks=_in_order(chain(first, blocks)), findings=reader.findings,
+                         problem=lambda: port.problem)
         return
     with open_log(Path(name), options) as log:
-        yield Source(name, log.sensor, log.units, log.read_as, _played(log.blocks, speed),
-                     log.findings)
+        yield Source(name, log.sensor, log.units, log.read_as,
+                     blocks=_played(log.blocks, speed), findings=log.findings)
 
 
 # ----------------------------------------------------------------------------- a recording
@@ -161,67 +164,55 @@ _RETURN = ('connect the sensor again; the page continues when it is back, and th
 
 
 class _Port:
-    """
-    A serial port; it is opened again when it returns after it was removed.
+    """A serial port; `problem` is why it sends nothing at present, empty if it is open."""
 
-    `problem` is why it sends nothing at present; empty if it is open. InputError if it cannot be
-    opened.
+    problem = ''
 
-    """
+    def lines(self, name: str, baud: int) -> Iterator[list[str]]:
+        """
+        Yield complete lines, or none after a moment; the first one, maybe cut, is left out.
 
-    def __init__(self, name: str, baud: int) -> None:
-        self._name, self._baud = name, baud
-        self.problem = ''
-        self._port: Any = None
-        self._rest, self._is_cut = b'', True
-        self._tried = time.monotonic()
-        self._open()
+        The port is opened again when it returns after it was removed. InputError if it cannot be
+        opened at the start.
 
-    def close(self) -> None:
-        """Close the port."""
-        if self._port is not None:
-            self._port.close()
-            self._port = None
-
-    def lines(self) -> Iterator[list[str]]:
-        """Yield complete lines, or none after a moment; the first one, maybe cut, is left out."""
-        while True:
-            *lines, rest = (self._rest + self._read()).split(b'\n')
-            self._rest = rest[-_LONGEST_LINE:]
-            if lines and self._is_cut:
-                lines, self._is_cut = lines[1:], False
-            yield [line[:_LONGEST_LINE].decode('utf-8', errors='replace').rstrip('\r')
-                   for line in lines]
-
-    def _open(self) -> None:
+        """
         with needing('pyserial', 'a serial port'):
             import serial
+        port: Any = None
+        rest, is_cut, tried = b'', True, -math.inf
         try:
-            self._port = serial.serial_for_url(self._name, baudrate=self._baud, timeout=_WAIT_S)
-        except (OSError, ValueError) as err:  # SerialException is an OSError
-            raise InputError(f'{self._name} cannot be opened: {err}', 'check its name, whether '
-                             'another program uses it, and your rights (on Linux: group '
-                             'dialout)') from err
-
-    def _read(self) -> bytes:
-        """Return the bytes that have arrived; after a loss, try to open the port again."""
-        if self._port is None:
-            time.sleep(_WAIT_S)
-            if time.monotonic() - self._tried >= _AGAIN_S:
-                self._tried, self.problem = time.monotonic(), ''
-                try:
-                    self._open()
-                except InputError as err:
-                    self.problem = f'{err.message}: {_RETURN}'
-            return b''
-        try:
-            found: bytes = self._port.read(self._port.in_waiting or 1)
-        except OSError as err:
-            self.close()
-            self._rest, self._is_cut = b'', True
-            self.problem = f'{self._name} does not send any more ({err}): {_RETURN}'
-            return b''
-        return found
+            while True:
+                found = b''
+                if port is None and time.monotonic() - tried >= _AGAIN_S:
+                    is_first, tried = tried < 0.0, time.monotonic()
+                    try:
+                        port = serial.serial_for_url(name, baudrate=baud, timeout=_WAIT_S)
+                        self.problem = ''
+                    except (OSError, ValueError) as err:  # SerialException is an OSError
+                        problem = InputError(
+                            f'{name} cannot be opened: {err}', 'check its name, whether another '
+                            'program uses it, and your rights (on Linux: group dialout)')
+                        if is_first:
+                            raise problem from err
+                        self.problem = f'{problem.message}: {_RETURN}'
+                if port is None:
+                    time.sleep(_WAIT_S)
+                else:
+                    try:
+                        found = port.read(port.in_waiting or 1)
+                    except OSError as err:
+                        port.close()
+                        port, rest, is_cut = None, b'', True
+                        self.problem = f'{name} does not send any more ({err}): {_RETURN}'
+                *lines, rest = (rest + found).split(b'\n')
+                rest = rest[-_LONGEST_LINE:]
+                if lines and is_cut:
+                    lines, is_cut = lines[1:], False
+                yield [line[:_LONGEST_LINE].decode('utf-8', errors='replace').rstrip('\r')
+                       for line in lines]
+        finally:
+            if port is not None:
+                port.close()
 
 
 def _understood(name: str, lines: Iterator[list[str]], options: LogOptions, baud: int

@@ -18,7 +18,8 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
 import io
 from ipaddress import ip_address
 import json
@@ -33,7 +34,7 @@ from aiohttp import web, WSCloseCode, WSMsgType
 
 from .. import __version__
 from ..errors import InputError
-from ..session import COMMANDS as COMMANDS_OF_A_SESSION, ros_home
+from ..session import BUTTONS, ros_home
 from ..stored.exports import CALIBRATION_ALONE
 from ..text import read_json
 
@@ -55,9 +56,6 @@ _HEADERS = {'Server': 'accel_calib', 'X-Content-Type-Options': 'nosniff',
                 "frame-ancestors 'none'")}
 
 Message = Mapping[str, Any]
-
-COMMANDS = (*COMMANDS_OF_A_SESSION, 'enable', 'disable')
-"""Commands of the page."""
 
 LARGEST = 4096
 """Largest message of a viewer [bytes]."""
@@ -144,31 +142,14 @@ def secured(response: Answered) -> Answered:
     return response
 
 
+@dataclass(frozen=True)
 class Board:
     """What viewers are shown: the newest message of each kind, log lines, and the history."""
 
-    def __init__(self) -> None:
-        self.newest: dict[str, Message] = {}
-        self.history: deque[Message] = deque(maxlen=int(_HISTORY_S / PERIOD))
-        self.lines: deque[Message] = deque(maxlen=_LINES)
-
-    def take(self, message: Message) -> bool:
-        """Keep a message; return whether it is new."""
-        if message['kind'] == 'log':
-            self.lines.append(message)
-        elif message == self.newest.get(message['kind']):
-            return False
-        else:
-            self.newest[message['kind']] = message
-        return True
-
-    def welcome(self, why: str) -> Message:
-        """Return the answer to ``hello``; `why` commands are not accepted is empty if they are."""
-        kept = self.history.copy()
-        return {'kind': 'welcome', 'may': not why, 'why': why, 'version': __version__,
-                'exports': CALIBRATION_ALONE,
-                'history': {key: [each[key] for each in kept]
-                            for key in ('time', 'length', 'corrected')}}
+    newest: dict[str, Message] = field(default_factory=dict)
+    lines: deque[Message] = field(default_factory=lambda: deque(maxlen=_LINES))
+    history: deque[Message] = field(
+        default_factory=lambda: deque(maxlen=int(_HISTORY_S / PERIOD)))
 
 
 class TooManyError(InputError):
@@ -177,7 +158,7 @@ class TooManyError(InputError):
 
 class Viewer:
     """
-    A viewer, which is shown what is on a board; `ask` runs its commands, and `abort` ends it.
+    A viewer, which is shown what is on a board; `ask` answers its commands, and `abort` ends it.
 
     `why` it only looks is set when it is admitted, and empty if its commands are accepted. `news`
     is set when there is something new. It has been sending the same since `sending_since`, by the
@@ -186,11 +167,12 @@ class Viewer:
     """
 
     def __init__(self, board: Board, websocket: web.WebSocketResponse, abort: Callable[[], None],
-                 ask: Callable[[str, Callable[[bool, str], None]], object]) -> None:
+                 ask: Callable[[str], Awaitable[tuple[bool, str]]]) -> None:
         self._board, self._socket, self.abort, self._ask = board, websocket, abort, ask
         self._sent: dict[str, Message] = {}
         self._answers: deque[Message] = deque()
-        self._seen = self._asking = 0
+        self._asking: set[asyncio.Task[None]] = set()
+        self._seen = 0
         self.why, self.sending_since = '', math.inf
         self.news = asyncio.Event()
         raw = websocket.get_extra_info('socket')
@@ -208,7 +190,12 @@ class Viewer:
                         admit(self, token)
                         sending = asyncio.create_task(self._send_all())
                     case {'ask': {'id': int(number), 'command': str(command)}} if sending:
-                        self._run_command(number, command)
+                        if len(self._asking) + len(self._answers) >= _COMMANDS:
+                            raise InputError(f'{_COMMANDS} commands wait for their answers',
+                                             'load the page again')
+                        asking = asyncio.create_task(self._run_command(number, command))
+                        self._asking.add(asking)
+                        asking.add_done_callback(self._asking.discard)
                     case _:
                         raise _NOT_UNDERSTOOD
         except InputError as error:
@@ -229,29 +216,25 @@ class Viewer:
         except ValueError:
             raise _NOT_UNDERSTOOD from None
 
-    def _run_command(self, number: int, command: str) -> None:
+    async def _run_command(self, number: int, command: str) -> None:
         """Run a command, if the viewer may."""
-        def answer(success: bool, words: str) -> None:
-            self._asking -= 1
-            self._answers.append({'kind': 'answer', 'id': number, 'success': success,
-                                  'words': words})
-            self.news.set()
-
-        if self._asking + len(self._answers) >= _COMMANDS:
-            raise InputError(f'{_COMMANDS} commands wait for their answers', 'load the page again')
-        self._asking += 1
-        if self.why:
-            answer(False, self.why)
-        elif command not in COMMANDS:
-            answer(False, f'the page asks for {command[:40]!r}, expected one of '
-                   f'{", ".join(COMMANDS)}; load the page again')
-        else:
-            self._ask(command, answer)
+        success, words = False, self.why
+        if not words and command not in BUTTONS:
+            words = (f'the page asks for {command[:40]!r}, expected one of {", ".join(BUTTONS)}; '
+                     'load the page again')
+        if not words:
+            success, words = await self._ask(command)
+        self._answers.append({'kind': 'answer', 'id': number, 'success': success, 'words': words})
+        self.news.set()
 
     async def _send_all(self) -> None:
         """Send what is new, until the viewer ends or takes no data."""
         try:
-            await self._send(self._board.welcome(self.why))
+            kept = self._board.history.copy()
+            await self._send({
+                'kind': 'welcome', 'may': not self.why, 'why': self.why, 'version': __version__,
+                'exports': CALIBRATION_ALONE, 'history': {
+                    key: [each[key] for each in kept] for key in ('time', 'length', 'corrected')}})
             while True:
                 self.news.clear()
                 answers = len(self._answers)  # later ones may be about a state that is not sent

@@ -49,6 +49,9 @@ from ..geometry import rotation_from_rpy
 from ..table import Autopilot, Floats, numbered, Recording
 from ..text import counted, some
 
+FILTERED = 'vehicle_acceleration'
+"""Message of PX4 with filtered readings, without the bias that it estimates."""
+
 DENSE_HZ = 5.0
 """Samples per second below which another message is preferred."""
 
@@ -182,16 +185,11 @@ class Parameters:
         return value
 
     def three(self, values: Values, pattern: str, usual: float) -> Floats:
-        """Return the values of the axes, (3,); ``{}`` in the pattern is the axis."""
-        return np.array([self.lookup(values, pattern.format(axis), usual) for axis in 'XYZ'])
-
-    @property
-    def words(self) -> str:
-        """Return the values that are not the usual ones, in words."""
-        shown = ', '.join(f'{name} {value:.4g}' for name, value in sorted(
-            self.used.items(), key=lambda each: 'ACC' in each[0])[:_NAMED])
-        more = len(self.used) - _NAMED
-        return f'{shown} and {more} more' if more > 0 else shown
+        """Return the values of the axes, (3,), scales if 1 is usual; ``{}`` is the axis."""
+        found = np.array([self.lookup(values, pattern.format(axis), usual) for axis in 'XYZ'])
+        if usual == 1.0 and np.any(found <= 0.0):
+            raise UnknownCorrectionError(f'a scale is {np.min(found):g}')
+        return found
 
 
 Correction = Callable[[Values], ByAxis]
@@ -225,14 +223,16 @@ def px4_slot(stated: Iterable[Values], device: int, name: str = 'CAL_ACC') -> in
 
 
 def px4_correction(parameters: Parameters, autopilot: Autopilot, release: tuple[int, int] | None,
-                   values: Values) -> ByAxis:
-    """Return the correction of PX4 for an accelerometer, of a known release."""
+                   message: str, values: Values) -> ByAxis:
+    """Return the correction of PX4 for an accelerometer in a message, of a known release."""
+    if message == FILTERED:
+        raise UnknownCorrectionError(f'{message} lacks the bias that PX4 estimates')
     device, slot = autopilot.device_id, autopilot.instance
     if device is None:
         raise UnknownCorrectionError('the log does not state the device id of the accelerometer')
     start = 'uncalibrated ' if slot is None else f'CAL_ACC{slot}_'
     offset = parameters.three(values, f'{start}{{}}OFF', 0.0)
-    scale = _scale(parameters.three(values, f'{start}{{}}SCALE', 1.0))
+    scale = parameters.three(values, f'{start}{{}}SCALE', 1.0)
     number = parameters.lookup(values, f'{start}ROT', -1.0)
     if number < 0.0:  # internal: it follows the board
         number = parameters.lookup(values, 'SENS_BOARD_ROT', 0.0)
@@ -247,8 +247,8 @@ def px4_correction(parameters: Parameters, autopilot: Autopilot, release: tuple[
     constant, *thermal = (np.array([parameters.lookup(values, f'{start}X{order}_{axis}', 0.0)
                                     for axis in range(3)]) for order in range(DEGREE + 1))
     limits = values.get(f'{start}TMIN', 0.0), values.get(f'{start}TMAX', 100.0)
-    return ByAxis(offset + constant, scale, np.array(thermal), values.get(f'{start}TREF', 25.0),
-                  limits, rotation)
+    return ByAxis(offset=offset + constant, scale=scale, thermal=np.array(thermal),
+                  reference=values.get(f'{start}TREF', 25.0), limits=limits, rotation=rotation)
 
 
 def ardupilot_correction(parameters: Parameters, instance: int, values: Values) -> ByAxis:
@@ -257,7 +257,7 @@ def ardupilot_correction(parameters: Parameters, instance: int, values: Values) 
         raise UnknownCorrectionError(f'parameters of accelerometer {instance} are not read')
     start, thermal_start = f'INS_ACC{"" if instance == 1 else instance}', f'INS_TCAL{instance}_'
     offset = parameters.three(values, f'{start}OFFS_{{}}', 0.0)
-    scale = _scale(parameters.three(values, f'{start}SCAL_{{}}', 1.0))
+    scale = parameters.three(values, f'{start}SCAL_{{}}', 1.0)
     thermal, limits = np.zeros((DEGREE, 3)), (0.0, 0.0)
     if values.get(f'{thermal_start}ENABLE') == 1:
         thermal = np.array([parameters.three(values, f'{thermal_start}ACC{order}_{{}}', 0.0)
@@ -272,7 +272,8 @@ def ardupilot_correction(parameters: Parameters, instance: int, values: Values) 
     degrees = [parameters.lookup(values, name, 0.0) for name in names]
     rotation = (rotation_from_rpy(*np.radians(degrees)) if names
                 else _numbered('AHRS_ORIENTATION', number, _OF_ARDUPILOT))
-    found = ByAxis(offset, scale, thermal, ARDUPILOT_REFERENCE, limits, rotation)
+    found = ByAxis(offset=offset, scale=scale, thermal=thermal, reference=ARDUPILOT_REFERENCE,
+                   limits=limits, rotation=rotation)
     # The firmware adds the polynomial at CALTEMP, so that it is zero there.
     at_offset = values.get(f'INS_ACC{instance}_CALTEMP', -300.0)
     return replace(found, offset=offset - found.moved(at_offset))
@@ -283,12 +284,6 @@ def _numbered(name: str, number: float, known: Mapping[int, Sequence[float]]) ->
     if int(number) not in known:
         raise UnknownCorrectionError(f'{name} is {number:.0f}, a rotation that is not known')
     return rotation_from_rpy(*np.radians(known[int(number)]))
-
-
-def _scale(scale: Floats) -> Floats:
-    if np.any(scale <= 0.0):
-        raise UnknownCorrectionError(f'a scale is {np.min(scale):g}')
-    return scale
 
 
 # ------------------------------------------------------------------------- messages of a log
@@ -338,7 +333,7 @@ class Choice:
     def log(self, columns: Mapping[str, Floats], autopilot: Autopilot, parameters: Parameters,
             correction: Correction | None, notes: Iterable[str]) -> FlightLog:
         """Return the log without a correction, or with a note why that is not known."""
-        chosen, more, axes = self.message, list[str](), 'x forward, y right, z down'
+        more, axes = list[str](), 'x forward, y right, z down'
         kind, temperature, advice = _ABOUT[autopilot.firmware]
         try:
             columns = raw_columns(columns, parameters, correction) if correction else columns
@@ -347,11 +342,14 @@ class Choice:
             more.append(f'readings are left as the vehicle corrected them ({err}), so do not load '
                         f'an export of their calibration into it; {advice}')
         else:
-            if parameters.words:
-                more.append(f'the correction by the vehicle is undone: {parameters.words}')
+            if parameters.used:
+                used = sorted(parameters.used.items(), key=lambda each: 'ACC' in each[0])
+                words = ', '.join(f'{name} {value:.4g}' for name, value in used[:_NAMED])
+                others = f' and {len(used) - _NAMED} more' if len(used) > _NAMED else ''
+                more.append(f'the correction by the vehicle is undone: {words}{others}')
             if any(map(_TURNS.search, parameters.used)):
                 axes = 'axes of the sensor, before the rotation of the board'
-        read_as = f'{kind}, {chosen} at {chosen.rate_hz:.4g} Hz, m/s2, {axes}'
+        read_as = f'{kind}, {self.message} at {self.message.rate_hz:.4g} Hz, m/s2, {axes}'
         if 'temperature' in columns:
             read_as += f', {temperature}'
         recording = Recording(columns, numbered(columns), 'm/s2', self.sensor, autopilot)

@@ -34,7 +34,7 @@ from ..table import Floats
 from ..text import listed, some
 
 if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
+    from rosbags.interfaces import Connection, MessageDefinition
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
     from rosbags.typesys.store import Typestore
@@ -76,11 +76,6 @@ class Bag:
 
     def topics(self, msgtype: str) -> list[str]:
         return sorted({c.topic for c in self.reader.connections if c.msgtype == msgtype})
-
-    @property
-    def all_topics(self) -> str:
-        """Return the topics with their types, for a message."""
-        return some(sorted({f'{c.topic} ({c.msgtype})' for c in self.reader.connections}))
 
     def connections(self, topic: str, msgtype: str = IMU) -> list[Connection]:
         """Return the connections of a topic; a topic can have several."""
@@ -133,20 +128,11 @@ class Bag:
                              'record while the sensor publishes')
         return frame_ids(self.joined(block, topic, msgtype))[0] if block else ''
 
-    def types(self, connection: Connection) -> Typestore:
-        """Return the types of a connection: those that the bag defines, or the usual ones."""
-        from rosbags.typesys import get_typestore, Stores
-
-        definition = connection.msgdef
-        if definition.data:
-            return _defined(definition.format.name, definition.data, connection.msgtype)
-        return get_typestore(Stores.ROS2_JAZZY if self.ros2 else Stores.ROS1_NOETIC)
-
     def numbers(self, connection: Connection) -> tuple[str, ...]:
         """Return the paths of the single numbers of a message, without headers and times."""
         from rosbags.interfaces import Nodetype
 
-        types = self.types(connection).fielddefs
+        types = types_of(connection.msgdef, connection.msgtype, self.ros2).fielddefs
 
         def below(msgtype: str, path: tuple[str, ...]) -> Iterator[str]:
             for name, (kind, about) in types[msgtype][1]:
@@ -164,8 +150,9 @@ class Bag:
         """Return the Imu topic, or check the given one; it must be one that the bag has."""
         topics = self.topics(IMU)
         if not topics:
-            raise InputError(f'{self.path} has {self.all_topics or "no topics"}, expected a topic '
-                             f'of type {IMU}', 'record the Imu topic')
+            every = some(sorted({f'{c.topic} ({c.msgtype})' for c in self.reader.connections}))
+            raise InputError(f'{self.path} has {every or "no topics"}, expected a topic of type '
+                             f'{IMU}', 'record the Imu topic')
         if topic not in topics and (topic or len(topics) > 1):
             found = (f'has the Imu topics {some(topics)}, expected {topic}' if topic else
                      f'has {len(topics)} Imu topics, expected one: {some(topics)}')
@@ -211,34 +198,19 @@ def imus_of(messages: Messages, name: str, before: int, sensor: str, *, chosen: 
     return columns, np.broadcast_to(same, len(messages))
 
 
-@contextmanager
-def open_bag(path: Path) -> Iterator[Bag]:
-    """
-    Open a bag for reading; for a bag of somebody else, in a child process.
-
-    Damage raises errors of any class, also later, while the bag is read.
-
-    """
-    from rosbags.rosbag1 import Reader as Reader1
-    from rosbags.rosbag2 import Reader as Reader2
-
-    ros2 = path.suffix != '.bag'
-    with ExitStack() as stack:
-        source, notes = _readable(path, stack)
-        reader: Any = stack.enter_context((Reader2 if ros2 else Reader1)(source))
-        yield Bag(path, reader, ros2, tuple(notes))
-
-
 @cache
-def _defined(kind: str, text: str, msgtype: str) -> Typestore:
-    """Return the types in a definition; an IDL definition has a line before each type."""
+def types_of(definition: MessageDefinition, msgtype: str, ros2: bool) -> Typestore:
+    """Return the types that the bag defines for a type of messages, or else the usual ones."""
     from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 
+    text = definition.data
+    if not text:
+        return get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
     store = get_typestore(Stores.EMPTY)
-    if kind == 'MSG':
+    if definition.format.name == 'MSG':
         store.register(get_types_from_msg(text, msgtype))
         return store
-    types, parts = {}, text.split(80 * '=' + '\n')
+    types, parts = {}, text.split(80 * '=' + '\n')  # a line before each type, in IDL
     for part in [part.partition('\n')[2] for part in parts[1:]] or parts:
         types.update(get_types_from_idl(part))
     store.register(types)
@@ -247,9 +219,19 @@ def _defined(kind: str, text: str, msgtype: str) -> Typestore:
 
 # ----------------------------------------------------------------------------- files of a bag
 
-def _readable(path: Path, stack: ExitStack) -> tuple[Path, list[str]]:
-    """Return the path to read, in a copy if SQLite cannot read it as it is, and notes."""
-    stored, notes = [path], []
+@contextmanager
+def open_bag(path: Path) -> Iterator[Bag]:
+    """
+    Open a bag for reading; for a bag of somebody else, in a child process.
+
+    It is read in a copy if SQLite cannot read it as it is. Damage raises errors of any class, also
+    later, while the bag is read.
+
+    """
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
+
+    source, stored, notes = path, [path], list[str]()
     if path.is_dir():
         for each in path.iterdir():
             if each.exists() and not each.is_dir():  # `rosbags` would wait for a pipe
@@ -268,7 +250,7 @@ def _readable(path: Path, stack: ExitStack) -> tuple[Path, list[str]]:
         elif len(stored) == 1:
             notes = [f'{path} has no metadata.yaml, as after a recorder was killed; '
                      f'{stored[0].name} is read without it']
-            path, = stored
+            source, = stored
     databases = [each for each in stored if each.suffix == '.db3']
     journals = [journal for each in databases for suffix in ('-wal', '-journal')
                 if (journal := each.with_name(each.name + suffix)).is_file()
@@ -276,7 +258,12 @@ def _readable(path: Path, stack: ExitStack) -> tuple[Path, list[str]]:
     if journals:
         notes.append('the recorder was killed; its last messages are read from '
                      f'{", ".join(each.name for each in journals)}')
-    return _copied(path, databases, journals, stack) if databases else path, notes
+    with ExitStack() as stack:
+        if databases:
+            source = _copied(source, databases, journals, stack)
+        ros2 = path.suffix != '.bag'
+        reader: Any = stack.enter_context((Reader2 if ros2 else Reader1)(source))
+        yield Bag(path, reader, ros2, tuple(notes))
 
 
 def _copied(path: Path, databases: Sequence[Path], journals: Sequence[Path], stack: ExitStack

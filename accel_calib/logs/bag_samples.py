@@ -28,7 +28,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .bag import Bag, BLOCK, imus_of, NUMBERS, open_bag, Received, TEMPERATURE
+from .bag import Bag, BLOCK, imus_of, NUMBERS, open_bag, Received, TEMPERATURE, types_of
 from .columns import topic_and_field
 from .names import ZEROS
 from .serialized import doubles_at, NANO, stamps_of
@@ -37,8 +37,6 @@ from ..table import concatenated, CONTEXT, Floats, Recording
 from ..text import counted, listed, some
 
 if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
-
     from .columns import LogOptions
 
 _PRESSURE = 'sensor_msgs/msg/FluidPressure'
@@ -48,7 +46,7 @@ _OF_TYPE = {TEMPERATURE: 'temperature', 'sensor_msgs/msg/BatteryState': 'supply_
 _ROWS = 65536
 """Smallest number of samples in a block of a recording."""
 
-_PEEKED = 100
+FIRST_MESSAGES = 100
 """Number of messages at the beginning of a topic that show its clock and its unit."""
 
 _SAME_CLOCK_S = 60.0
@@ -132,17 +130,13 @@ class ContextTopic:
     factor: float = 1.0
     summand: float = 0.0
 
-    @property
-    def what(self) -> str:
-        return f'{self.topic} ({self.msgtype})'
-
     def values(self, block: Sequence[Received]) -> tuple[Floats, Floats]:
         """Return the times [s] and values of messages; a damaged message is an InputError."""
         if self.msgtype == TEMPERATURE:
             messages = self.bag.joined(block, self.topic, TEMPERATURE)
             stamps, values = stamps_of(messages), doubles_at(messages, slice(0, 1))[:, 0]
         else:
-            store = self.bag.types(block[0][0])
+            store = types_of(block[0][0].msgdef, self.msgtype, self.bag.ros2)
             read = store.deserialize_cdr if self.bag.ros2 else store.deserialize_ros1
             found = [read(raw, self.msgtype) for _, _, raw in block]
             values = np.array([*map(attrgetter(self.field), found)], float)
@@ -190,8 +184,7 @@ def context_of(bag: Bag, imu: str, sensor: str, options: LogOptions
     notes: list[str] = []
     for quantity in map(quantity_of, dict.fromkeys((*CONTEXT, *options.context))):
         asked = options.context.get(quantity.key, '')
-        found = (_asked(bag, quantity, asked) if asked else
-                 _own(bag, imu, sensor) if quantity.key == 'temperature' else None)
+        found = _choose(bag, quantity, asked, imu, sensor)
         if found is not None:
             found, about = _with_clock_and_unit(found, imu, named=bool(asked))
             used += [found] if found is not None else []
@@ -200,11 +193,26 @@ def context_of(bag: Bag, imu: str, sensor: str, options: LogOptions
     return used, notes
 
 
-def _asked(bag: Bag, quantity: Quantity, asked: str) -> ContextTopic:
+def _choose(bag: Bag, quantity: Quantity, asked: str, imu: str, sensor: str
+            ) -> ContextTopic | None:
+    """Return the topic that is asked for, or the Temperature that belongs to the Imu, or None."""
+    if not asked:
+        temperatures = [
+            topic for topic in bag.topics(TEMPERATURE) if quantity.key == 'temperature' and any(
+                connection.msgcount for connection in bag.connections(topic, TEMPERATURE))]
+        space = imu.rpartition('/')[0]
+        for wanted in (lambda topic: True,
+                       lambda topic: sensor and bag.frame_id(topic, TEMPERATURE) == sensor,
+                       lambda topic: space and topic.rpartition('/')[0] == space):
+            of_imu = [topic for topic in temperatures if wanted(topic)]
+            if len(of_imu) == 1:
+                return ContextTopic(bag, quantity, of_imu[0], TEMPERATURE, 'temperature')
+        return None
     topic, field = topic_and_field(asked, {c.topic for c in bag.reader.connections})
     known = [connection for connection in bag.reader.connections if connection.topic == topic]
     if not known:
-        raise InputError(f'{bag.path} has the topics {bag.all_topics}, expected {topic}',
+        every = some(sorted({f'{c.topic} ({c.msgtype})' for c in bag.reader.connections}))
+        raise InputError(f'{bag.path} has the topics {every}, expected {topic}',
                          f'choose one of them with --context {quantity.key}:=TOPIC')
     numbers = bag.numbers(known[0])
     if found := field_of(quantity.key, numbers, field):
@@ -216,69 +224,61 @@ def _asked(bag: Bag, quantity: Quantity, asked: str) -> ContextTopic:
         f'{quantity.key}:={topic}/FIELD')
 
 
-def _own(bag: Bag, imu: str, sensor: str) -> ContextTopic | None:
-    """Return the topic of type Temperature that belongs to the Imu, or None."""
-    known = [topic for topic in bag.topics(TEMPERATURE)
-             if any(connection.msgcount for connection in bag.connections(topic, TEMPERATURE))]
-    space = imu.rpartition('/')[0]
-    for wanted in (lambda topic: True,
-                   lambda topic: sensor and bag.frame_id(topic, TEMPERATURE) == sensor,
-                   lambda topic: space and topic.rpartition('/')[0] == space):
-        of_imu = [topic for topic in known if wanted(topic)]
-        if len(of_imu) == 1:
-            return ContextTopic(bag, QUANTITIES[0], of_imu[0], TEMPERATURE, 'temperature')
-    return None
-
-
 def _with_clock_and_unit(topic: ContextTopic, imu: str, *, named: bool
                          ) -> tuple[ContextTopic | None, list[str]]:
     """Return a topic with its clock and unit, as its first messages show them, and notes."""
-    block = topic.bag.first(topic.topic, topic.msgtype, _PEEKED)
+    block = topic.bag.first(topic.topic, topic.msgtype, FIRST_MESSAGES)
     time, values = topic.values(block) if block else (np.zeros(0), np.zeros(0))
-    known = values[np.isfinite(values)]
-    if not len(known) and len(block) < _PEEKED:
-        message = f'{counted(len(block), "message")} on {topic.what} with no finite number'
+    known, what = values[np.isfinite(values)], f'{topic.topic} ({topic.msgtype})'
+    if not len(known) and len(block) < FIRST_MESSAGES:
+        message = f'{counted(len(block), "message")} on {what} with no finite number'
         if named:
             raise InputError(f'{topic.bag.path} has {message}, expected the '
                              f'{topic.quantity.words}', 'name another topic')
         return None, [f'there is no {topic.quantity.words}: {message}']
     notes = []
     late = 0.0  # the stamps of the first messages of the Imu after their receipt [s]
-    if of_imu := topic.bag.first(imu, size=_PEEKED):
+    if of_imu := topic.bag.first(imu, size=FIRST_MESSAGES):
         stamps = stamps_of(topic.bag.joined(of_imu, imu))
         late = float(np.median(stamps - _received(of_imu)))
     if not np.median(np.abs(time - _received(block) - late)) <= _SAME_CLOCK_S:
         topic = replace(topic, late=late)
-        notes.append(f'the messages on {topic.what} have no stamp of the clock of the Imu: their '
+        notes.append(f'the messages on {what} have no stamp of the clock of the Imu: their '
                      'times are those at which the bag received them')
     if topic.msgtype != TEMPERATURE and len(known):
         typical, (ours, lowest, highest, *_) = float(np.median(known)), topic.quantity.units[0]
         fitting = [unit for unit in topic.quantity.units if unit[1] <= typical < unit[2]]
         if not fitting:
-            raise InputError(f'{topic.bag.path}: the values on {topic.what} are about '
+            raise InputError(f'{topic.bag.path}: the values on {what} are about '
                              f'{typical:.4g}, expected a {topic.quantity.words} from {lowest:g} '
                              f'to {highest:g} {ours}', 'name another topic')
         name, _, _, factor, summand = fitting[0]
         topic = replace(topic, factor=factor, summand=summand)
-        notes += [f'the numbers on {topic.what} are read as {name}'] if name != ours else []
+        notes += [f'the numbers on {what} are read as {name}'] if name != ours else []
     return topic, notes
 
 
-def rate_words(bag: Bag, imu: str) -> str:
-    """Return the rate of an Imu, by the receipt of its first messages; empty if not known."""
-    received = _received(bag.first(imu, size=_PEEKED))
-    seconds = float(np.ptp(received)) if len(received) else 0.0
-    return f' at {(len(received) - 1) / seconds:.3g} Hz' if seconds > 0.0 else ''
-
-
 def _not_used(bag: Bag, quantity: Quantity, used: ContextTopic | None) -> list[str]:
-    topics = dict(sorted({c.topic: c.msgtype for c in bag.reader.connections
-                          if c.msgcount and (used is None or c.topic != used.topic)
-                          and _looks_like(c, quantity)}.items()))
-    named = [f'{topic} ({msgtype})' for topic, msgtype in topics.items()]
+    """Return notes about topics whose name, type or definition shows a quantity."""
+    topics, parts = {}, '|'.join(quantity.parts)
+    defined = re.compile(rf'^\s*(?:float|double|u?int)\d*\s+\w*(?:{parts})\w*\s*(?:[#;]|$)',
+                         re.IGNORECASE | re.MULTILINE)
+    for each in bag.reader.connections:
+        if not each.msgcount or (used is not None and each.topic == used.topic):
+            continue
+        if each.msgtype in _OF_TYPE:
+            is_like = _OF_TYPE[each.msgtype] == quantity.key
+        elif each.msgtype.startswith('std_msgs/'):
+            single = each.msgtype.rpartition('/')[2].lower() in NUMBERS
+            is_like = single and bool(re.search(parts, each.topic.lower()))
+        else:
+            is_like = bool(defined.search(each.msgdef.data))
+        if is_like:
+            topics[each.topic] = f'{each.topic} ({each.msgtype})'
+    named = [topics[topic] for topic in sorted(topics)]
     if len(named) == 1:
         return [f'topic {named[0]} looks like a {quantity.words} and is not used: name it with '
-                f'--context {quantity.key}:={next(iter(topics))}']
+                f'--context {quantity.key}:={min(topics)}']
     if named:
         return [f'topics {some(named)} look like a {quantity.words} and are not used: name '
                 f'one with --context {quantity.key}:=TOPIC']
@@ -287,18 +287,6 @@ def _not_used(bag: Bag, quantity: Quantity, used: ContextTopic | None) -> list[s
         return [f'{listed("topic", pressures)} ({_PRESSURE}): a pressure is no temperature, and '
                 'the bag has no other topic that looks like one']
     return []
-
-
-def _looks_like(connection: Connection, quantity: Quantity) -> bool:
-    """Return whether the name, the type or the definition of a topic shows a quantity."""
-    if connection.msgtype in _OF_TYPE:
-        return _OF_TYPE[connection.msgtype] == quantity.key
-    parts = '|'.join(quantity.parts)
-    if connection.msgtype.startswith('std_msgs/'):
-        single = connection.msgtype.rpartition('/')[2].lower() in NUMBERS
-        return single and bool(re.search(parts, connection.topic.lower()))
-    return bool(re.search(rf'^\s*(?:float|double|u?int)\d*\s+\w*(?:{parts})\w*\s*(?:[#;]|$)',
-                          connection.msgdef.data, re.IGNORECASE | re.MULTILINE))
 
 
 # ----------------------------------------------------------------------------------- samples
@@ -332,32 +320,14 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool,
 
 # ---------------------------------------------------------------------------------- messages
 
-def _needed(bag: Bag, needs: Collection[str], used: Sequence[ContextTopic], notes: Sequence[str]
-            ) -> dict[str, Floats]:
-    """Return the tracks of the quantities that a calibration needs; InputError without one."""
-    topics, tracks = {source.quantity: source for source in used}, {}
-    for quantity in dict.fromkeys([*QUANTITIES, *topics]):
-        if quantity.key not in needs:
-            continue
-        if quantity not in topics:
-            raise InputError(f'{bag.path} has no {quantity.words} in a topic that is used'
-                             f'{"".join(f"; {line}" for line in notes)}, but the calibration '
-                             f'depends on the {quantity.words}', 'name the topic with --context '
-                             f'{quantity.key}:=TOPIC, or use a calibration without it')
-        track = tracks[quantity.key] = topics[quantity].track()
-        if np.isnan(track[1, 0]):
-            raise InputError(f'{bag.path}: {topics[quantity].topic} has no finite number, '
-                             f'expected the {quantity.words}', 'name another topic')
-    return tracks
-
-
 def messages_of(path: Path, options: LogOptions, needs: Collection[str]) -> Generator[Any]:
     """
     Yield what a corrected copy of a bag needs: what is known first, the messages, the notes.
 
     The options are those of the Imu topic and of the context, of which only the `needs` of a
-    calibration are read. Messages come in blocks, with the number of their connection, the time of
-    receipt [ns] and the size of each, and their bytes.
+    calibration are read: InputError if one of them is not in the bag. Messages come in blocks,
+    with the number of their connection, the time of receipt [ns] and the size of each, and their
+    bytes.
 
     """
     from rosbags.rosbag2.metadata import dump_qos_v9
@@ -366,7 +336,20 @@ def messages_of(path: Path, options: LogOptions, needs: Collection[str]) -> Gene
         topic = bag.imu_topic(options.topic)
         sensor = bag.frame_id(topic)
         used, notes = context_of(bag, topic, sensor, options)
-        tracks = _needed(bag, needs, used, notes)
+        topics, tracks = {source.quantity: source for source in used}, dict[str, Floats]()
+        for quantity in dict.fromkeys([*QUANTITIES, *topics]):
+            if quantity.key not in needs:
+                continue
+            if quantity not in topics:
+                raise InputError(f'{bag.path} has no {quantity.words} in a topic that is used'
+                                 f'{"".join(f"; {line}" for line in notes)}, but the calibration '
+                                 f'depends on the {quantity.words}', 'name the topic with '
+                                 f'--context {quantity.key}:=TOPIC, or use a calibration without '
+                                 'it')
+            track = tracks[quantity.key] = topics[quantity].track()
+            if np.isnan(track[1, 0]):
+                raise InputError(f'{bag.path}: {topics[quantity].topic} has no finite number, '
+                                 f'expected the {quantity.words}', 'name another topic')
         connections = bag.reader.connections
         number = {id(each): k for k, each in enumerate(connections)}
         imu = [number[id(each)] for each in bag.connections(topic)]

@@ -278,7 +278,14 @@ class _Server:
         with self._turn:
             try:
                 if self._process is None:
-                    self._start()
+                    self._socket, theirs = socket.socketpair()
+                    path = [*filter(None, sys.path), str(Path(__file__).parents[2])]
+                    with theirs:
+                        # In its own session it does not receive the Ctrl-C of a terminal.
+                        self._process = subprocess.Popen(
+                            [sys.executable, '-c', _START, *path], stdin=theirs.fileno(),
+                            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                            start_new_session=True, env={**os.environ, **_ENVIRONMENT})
                 socket.send_fds(self._socket, [request], streams)
                 if answer := self._socket.recv(_PID_BYTES):
                     return int.from_bytes(answer, 'little', signed=True)
@@ -289,16 +296,6 @@ class _Server:
             except BaseException:  # of a signal: its answer may still come
                 self.close()
                 raise
-
-    def _start(self) -> None:
-        self._socket, theirs = socket.socketpair()
-        path = [*filter(None, sys.path), str(Path(__file__).parents[2])]
-        with theirs:
-            # In its own session it does not receive the Ctrl-C of a terminal.
-            self._process = subprocess.Popen(
-                [sys.executable, '-c', _START, *path], stdin=theirs.fileno(),
-                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
-                env={**os.environ, **_ENVIRONMENT})
 
     def close(self) -> None:
         """End the server and its children."""

@@ -20,9 +20,9 @@ import numpy as np
 
 from .dialect import Cells, is_clock, is_number, Layout, shown
 from .names import (
-    BARE, bare_name, check_sensor, COUNTERS, format_named, FREE_WORDS, is_unit, LINEAR_WORDS,
-    LogFormat, may_cause, Meaning, meaning, OURS, RATE, READING, recognise, unit_of, WHOLE_WORDS,
-    WORDS)
+    BARE, bare_name, check_sensor, COMPUTED_WORDS, COUNTERS, format_named, FREE_WORDS,
+    LINEAR_WORDS, LogFormat, Meaning, meaning, OURS, RATE, READING, recognise, unit_of, UNITS,
+    WHOLE_WORDS, WORDS)
 from ..errors import InputError
 from ..table import COLUMNS, CONTEXT, Floats, quantity_key
 from ..units import STANDARD_GRAVITY, UnitName
@@ -217,28 +217,26 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
     sources = {key: tuple(found[name] for name in own.names) for key, own in COLUMNS.items()
                if found.keys() >= {*own.names}}
     sources |= {key: (source,) for key, source in found.items() if key not in OURS}
-    return _with_indices(layout, sources, maker, options.partial)
-
-
-def _with_indices(layout: Layout, sources: Mapping[str, tuple[Source, ...]],
-                  maker: LogFormat | None, partial: bool) -> Chosen:
     index = {key: tuple(source.index for source in own) for key, own in sources.items()}
     clocks = layout.first(index['time'][0])[:_FIRST_ROWS] if 'time' in index else []
     dates = index['time'] if clocks and all(map(is_clock, clocks)) else ()
     texts = {'label', 'time'} if dates else {'label'}
     needed = {k for key, which in index.items() if key not in texts for k in which}
-    of_poses = partial or bool(OF_POSES & index.keys())
+    of_poses = options.partial or bool(OF_POSES & index.keys())
     context = {k for key in CONTEXT for k in index.get(key, ())} if of_poses else set[int]()
     used = {k for which in index.values() for k in which}
     quantities: dict[str, int] = {}  # the other columns of numbers that can be a cause
-    for k, name in enumerate(() if maker else layout.header[:MOST]):
-        free = k not in used and meaning(name).quantity in ('', *sources) and may_cause(name)
-        cells = layout.first(k)
-        cells = list(filter(None, cells)) or cells if of_poses else cells
-        if free and quantity_key(name) and _are_numbers(cells):
+    for k, name in enumerate(() if maker else header[:MOST]):
+        known, cells = meaning(name), layout.first(k)
+        if (k not in used and known.quantity in {'', *sources} - {'reading', 'rate', 'time'}
+                and bare_name(name) not in COUNTERS and COMPUTED_WORDS.isdisjoint(known.group)
+                and quantity_key(name)
+                and _are_numbers(list(filter(None, cells)) or cells if of_poses else cells)):
             quantities.setdefault(quantity_key(name), k)
-    return Chosen(layout, sources, maker, tuple(sorted(needed - context)),
-                  tuple(sorted(context)), index.get('label', ()), dates, quantities)
+    return Chosen(
+        layout=layout, sources=sources, maker=maker, needed=tuple(sorted(needed - context)),
+        context=tuple(sorted(context)), labels=index.get('label', ()), dates=dates,
+        quantities=quantities)
 
 
 def _are_numbers(cells: Sequence[str]) -> bool:
@@ -296,7 +294,7 @@ def _source(layout: Layout, index: int) -> Source:
     unit = meaning(layout.header[index]).unit if index < len(layout.header) else ''
     if not unit and index < len(layout.units_row):
         below = layout.units_row[index].strip('()[]')
-        unit = below if is_unit(below) else ''
+        unit = below if any(unit_of(key, below) for key in UNITS) else ''
     return Source(index, layout.name(index), unit)
 
 
@@ -375,7 +373,16 @@ def _bare(header: Sequence[str]) -> list[list[int]]:
 def _contexts(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
     more: dict[str, Source] = {}
     header = layout.header
-    clocks = {} if 'time' in found else _clocks(layout)
+    # Columns of times that run, and how finely. A date that stays the same, or a time of the day
+    # in whole seconds, is no clock of the samples.
+    cells = {k: layout.first(k) for k in _named('time', header) if 'time' not in found}
+    different = {k: len(set(texts)) for k, texts in cells.items()
+                 if all(is_number(text.replace(',', '.')) or is_clock(text)
+                        for text in texts[:_FIRST_ROWS])}
+    different |= {k: max(different.get(other.index, 0), different[k]) for k in different
+                  for other in _fraction(layout, k).values()}
+    clocks = {k: 2 * count >= max(different.values()) for k, count in different.items()
+              if count > 1 or len(cells[k]) < _FIRST_ROWS}
     if clocks:
         # The name that is most plainly that of the time of a sample.
         best = max(clocks, key=lambda k: (
@@ -396,23 +403,6 @@ def _contexts(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
         if key not in found and len(which) == 1:
             more[key] = _source(layout, which[0])
     return more
-
-
-def _clocks(layout: Layout) -> dict[int, bool]:
-    """
-    Return the columns of times that run, and whether they run as finely as the finest one.
-
-    A date that stays the same, or a time of the day in whole seconds, is no clock of the samples.
-
-    """
-    cells = {k: layout.first(k) for k in _named('time', layout.header)}
-    different = {k: len(set(texts)) for k, texts in cells.items()
-                 if all(is_number(text.replace(',', '.')) or is_clock(text)
-                        for text in texts[:_FIRST_ROWS])}
-    different |= {k: max(different.get(other.index, 0), different[k]) for k in different
-                  for other in _fraction(layout, k).values()}
-    return {k: 2 * count >= max(different.values()) for k, count in different.items()
-            if count > 1 or len(cells[k]) < _FIRST_ROWS}
 
 
 def _counter(layout: Layout) -> Source | None:
@@ -451,13 +441,3 @@ def _fraction(layout: Layout, best: int) -> dict[str, Source]:
             if other.group == known.group and unit_of('time', other.unit) == ('ns', 1e-9):
                 return {FRACTION: _source(layout, k)}
     return {}
-
-
-def unused(columns: Chosen) -> list[str]:
-    """Return notes about columns that look like a temperature and are not used."""
-    header = columns.layout.header
-    names = [header[k] for k in _named('temperature', header)]
-    if 'temperature' in columns.sources or not names:
-        return []
-    return [f'not used, though the names look like temperatures: {shown(names)}; choose one with '
-            f'--columns temperature={names[0]}']

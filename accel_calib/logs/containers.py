@@ -21,18 +21,16 @@ MATLAB are refused: only MATLAB can convert all of them. No pickled object is re
 
 from __future__ import annotations
 
-import bz2
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 import csv
 from dataclasses import dataclass
 from functools import partial
-import gzip
+from importlib import import_module
 import io
 from itertools import chain, islice
 import json
-import lzma
 from pathlib import Path
 import re
 import sys
@@ -58,19 +56,13 @@ CELL_BYTES = 18
 _PIECE, _ENCRYPTED = 1 << 16, 1
 
 
-def _open_zstd(path: Path) -> Any:
-    """Open a file with the zstd of Python 3.14, or with that which `rosbags` needs before."""
-    if sys.version_info >= (3, 14):
-        from compression import zstd
-    else:
-        from backports import zstd
-    return zstd.open(path)
+_ZSTD = 'compression.zstd' if sys.version_info >= (3, 14) else 'backports.zstd'
+"""The zstd of Python 3.14, or that which `rosbags` needs before."""
 
-
-PACKED: Mapping[str, tuple[bytes, Callable[..., Any]]] = {
-    '.gz': (rb'\x1f\x8b\x08', gzip.open), '.bz2': (rb'BZh\d1AY&SY', bz2.open),
-    '.xz': (rb'\xfd7zXZ\0', lzma.open), '.zst': (rb'\x28\xb5\x2f\xfd', _open_zstd)}
-"""First bytes of packed files by suffix, and the functions that open them."""
+PACKED: Mapping[str, tuple[bytes, str]] = {
+    '.gz': (rb'\x1f\x8b\x08', 'gzip'), '.bz2': (rb'BZh\d1AY&SY', 'bz2'),
+    '.xz': (rb'\xfd7zXZ\0', 'lzma'), '.zst': (rb'\x28\xb5\x2f\xfd', _ZSTD)}
+"""First bytes of packed files by suffix, and the modules that open them."""
 
 UNPACK = 'unpack it, and use the log in it'
 
@@ -93,23 +85,25 @@ class Member:
     parts: Callable[[], Bytes]
 
 
+@dataclass(eq=False)
 class Stream(io.RawIOBase):
     """The bytes of a table as a file; damaged bytes are an InputError."""
 
-    def __init__(self, file: LogFile, parts: Bytes) -> None:
-        self._file, self._parts, self._left = file, parts, memoryview(b'')
+    file: LogFile
+    parts: Bytes
+    left: memoryview = memoryview(b'')
 
     def readable(self) -> bool:
         return True
 
     def readinto(self, buffer: Any, /) -> int:
-        while not self._left:
-            with self._file.refused():
-                part = next(self._parts, None)
+        while not self.left:
+            with self.file.refused():
+                part = next(self.parts, None)
             if part is None:
                 return 0
-            self._left = memoryview(part)
-        taken, self._left = self._left[:len(buffer)], self._left[len(buffer):]
+            self.left = memoryview(part)
+        taken, self.left = self.left[:len(buffer)], self.left[len(buffer):]
         buffer[:len(taken)] = taken
         return len(taken)
 
@@ -124,9 +118,9 @@ def text(path: Path, _: ExitStack) -> list[Member]:
     """Return the only table of a file, unpacked if it is packed."""
     with path.open('rb') as file:
         head = file.read(10)
-    unpack = next((opened for first, opened in PACKED.values() if re.match(first, head)),
-                  io.FileIO)
-    return [Member('', path.stat().st_size, partial(_pieces, partial(unpack, path)))]
+    packed = next((module for first, module in PACKED.values() if re.match(first, head)), 'io')
+    opened = partial(import_module(packed).open, path, 'rb')
+    return [Member('', path.stat().st_size, partial(_pieces, opened))]
 
 
 def archived(path: Path, stack: ExitStack) -> list[Member]:
@@ -237,29 +231,21 @@ def _named(record: Record) -> tuple[str, Record]:
     return next((name for name in names if isinstance(name, str)), ''), record
 
 
-def json_line(line: str) -> tuple[str, Record]:
-    """Return the series of a line of JSON, and the record."""
-    return _named(read_json(line))
-
-
-def influx_line(line: str) -> tuple[str, Record]:
-    """Return the series of a line in the line protocol of InfluxDB, and the record."""
-    found = _INFLUX.fullmatch(line)
-    if found is None:
-        raise ValueError(f'{line[:40]!r} is no line of InfluxDB')
-    record = {key: value.rstrip('iu') for key, value in _FIELD.findall(found[2])}
-    return found[1], {'timestamp': found[3], **record}
-
-
-def lines(parse: Callable[[str], tuple[str, Record]], path: Path, _: ExitStack) -> list[Member]:
-    """Return the series of a file of one record per line; a function parses a line."""
+def lines(kind: str, path: Path, _: ExitStack) -> list[Member]:
+    """Return the series of a file of one record per line: 'json', or 'influx' of InfluxDB."""
     def records() -> Iterator[tuple[str, Record]]:
         with path.open(encoding='utf-8-sig', errors='replace') as file:
             for number, line in enumerate(iter(partial(file.readline, _LONGEST_LINE), ''), 1):
                 if line.isspace() or line[0] == '#':
                     continue
                 try:
-                    yield parse(line)
+                    if kind == 'json':
+                        yield _named(read_json(line))
+                    elif found := _INFLUX.fullmatch(line):
+                        cells = {key: text.rstrip('iu') for key, text in _FIELD.findall(found[2])}
+                        yield found[1], {'timestamp': found[3], **cells}
+                    else:
+                        raise ValueError(f'{line[:40]!r} is no line of InfluxDB')
                 except ValueError as err:
                     if line.endswith('\n'):  # only the last line can be cut
                         raise InputError(f'{path}: line {number} is no record ({err}), expected '
@@ -326,8 +312,8 @@ _EXPORT = 'store arrays of numbers'
 _EXPORT_MATLAB = ('write a CSV file in MATLAB: writetimetable(Acceleration, "log.csv"), or '
                   'writematrix for an array')
 
-_Held = tuple[tuple[int, ...], str, Callable[[], Any]]
-"""An array in a file: its shape, the kind of its elements, and the function that reads it."""
+_Held = Mapping[str, tuple[tuple[int, ...], str]]
+"""The arrays in a file by name: their shapes, and the kinds of their elements."""
 
 
 def matlab(path: Path, _: ExitStack) -> list[Member]:
@@ -336,26 +322,21 @@ def matlab(path: Path, _: ExitStack) -> list[Member]:
         held = scipy.io.whosmat(path)
     except TypeError:  # of scipy, for tables, timetables and other objects
         held = []
-
-    def load(name: str) -> Any:
-        return scipy.io.loadmat(path, variable_names=[name])[name]
-
-    return _tables(path, {name: (shape, kind, partial(load, name)) for name, shape, kind in held},
-                   _EXPORT_MATLAB)
+    return _tables(path, {name: (shape, kind) for name, shape, kind in held}, lambda name: (
+        scipy.io.loadmat(path, variable_names=[name])[name]), _EXPORT_MATLAB)
 
 
 def hdf5(path: Path, stack: ExitStack) -> list[Member]:
     """Return the arrays of an HDF5 file, such as one of MATLAB 7.3; links are not followed."""
     import h5py
 
-    held: dict[str, _Held] = {}
-
-    def add(name: str, each: Any) -> None:
-        if isinstance(each, h5py.Dataset) and name[0] != '#' and not each.external:
-            held[name] = (each.shape or (), each.dtype.name, lambda: each[()])
-
-    stack.enter_context(h5py.File(path)).visititems(add)
-    return _tables(path, held, _EXPORT)
+    found: dict[str, Any] = {}
+    stack.enter_context(h5py.File(path)).visititems(
+        lambda name, each: found.update({name: each}))
+    return _tables(path, {
+        name: (each.shape or (), each.dtype.name) for name, each in found.items()
+        if isinstance(each, h5py.Dataset) and name[0] != '#' and not each.external
+    }, lambda name: found[name][()], _EXPORT)
 
 
 def of_numpy(path: Path, stack: ExitStack) -> list[Member]:
@@ -365,32 +346,28 @@ def of_numpy(path: Path, stack: ExitStack) -> list[Member]:
         archive = stack.enter_context(zipfile.ZipFile(path))
         files = {name.removesuffix('.npy'): partial(archive.open, name)
                  for name in archive.namelist()}
-
-    def load(name: str) -> Any:
-        with files[name]() as file:
-            return np.lib.format.read_array(file, allow_pickle=False)
-
-    held: dict[str, _Held] = {}
+    held = {}
     for name, opened in files.items():
         with opened() as file:
             is_first = np.lib.format.read_magic(file) == (1, 0)
             shape, _, dtype = (np.lib.format.read_array_header_1_0 if is_first else
                                np.lib.format.read_array_header_2_0)(file)
-        held[name] = (shape, dtype.name, partial(load, name))
-    return _tables(path, held, _EXPORT)
+        held[name] = shape, dtype.name
+    return _tables(path, held, lambda name: np.lib.format.read_array(
+        stack.enter_context(files[name]()), allow_pickle=False), _EXPORT)
 
 
-def _tables(path: Path, held: Mapping[str, _Held], advice: str) -> list[Member]:
-    """Return arrays as tables; InputError without plain arrays."""
-    plain = {name: load for name, (shape, kind, load) in held.items()
-             if _NUMBERS.fullmatch(kind) and 0 < len(shape) <= 2 and max(shape) > 1}
+def _tables(path: Path, held: _Held, load: Callable[[str], Any], advice: str) -> list[Member]:
+    """Return arrays, which a function loads, as tables; InputError without plain arrays."""
+    plain = [name for name, (shape, kind) in held.items()
+             if _NUMBERS.fullmatch(kind) and 0 < len(shape) <= 2 and max(shape) > 1]
     if not plain:
-        kinds = shown([f'{kind} {name}' for name, (_, kind, _) in held.items()])
+        kinds = shown([f'{kind} {name}' for name, (_, kind) in held.items()])
         raise InputError(f'{path} holds {kinds or "timetables or other objects"}, expected plain '
                          'arrays of numbers', advice)
     arrays = {}
-    for name, load in plain.items():
-        values = load()
+    for name in plain:
+        values = load(name)
         for field in values.dtype.names or ('',):  # of records
             column = values[field] if field else values
             if column.dtype.kind == 'M':  # dates in s since 1970

@@ -202,30 +202,24 @@ def is_clock(text: str) -> bool:
 
 def seconds_of(texts: NDArray[np.object_], path: Path, rows: NDArray[np.int64]) -> Floats:
     """Return the seconds of dates since 1970, or of times since midnight; else InputError."""
-    seconds = [_seconds(text) for text in texts]
-    if None in seconds:
-        k = seconds.index(None)
-        raise InputError(f'{path}: row {rows[k]} has the time {texts[k][:40]!r}, expected one '
-                         'such as 2026-01-31T12:00:00.250', 'correct the row or remove it')
-    return np.array(seconds, dtype=float)
-
-
-def _seconds(text: str) -> float | None:
-    match = CLOCK.fullmatch(text)
-    if match is None:
-        return None
-    date, hours, minute, second, digits, half, zone = match.groups()
-    day, hour = _day(date) if date else 0.0, int(hours)
-    if half and 1 <= hour <= 12:
-        hour = hour % 12 + 12 * (half[0] in 'Pp')
-    if day is None or not (hour < 24 and int(minute) < 60 and int(second or 0) <= 60):
-        return None
-    fraction, offset = float(f'0.{digits or 0}'), 0.0
-    if zone not in (None, 'Z', 'UTC'):
-        size = int(zone[1:3]) * 3600.0 + int(zone[3:].lstrip(':') or 0) * 60.0
-        offset = -size if zone[0] == '-' else size
-    whole = day + hour * 3600.0 + int(minute) * 60.0 + int(second or 0)
-    return whole - offset + fraction  # all in s
+    seconds = np.zeros(len(texts))
+    for k, text in enumerate(texts):
+        day, match = None, CLOCK.fullmatch(text)
+        if match is not None:
+            date, hours, minute, second, digits, half, zone = match.groups()
+            day, hour = _day(date) if date else 0.0, int(hours)
+            if half and 1 <= hour <= 12:
+                hour = hour % 12 + 12 * (half[0] in 'Pp')
+        if day is None or not (hour < 24 and int(minute) < 60 and int(second or 0) <= 60):
+            raise InputError(f'{path}: row {rows[k]} has the time {text[:40]!r}, expected one '
+                             'such as 2026-01-31T12:00:00.250', 'correct the row or remove it')
+        fraction, offset = float(f'0.{digits or 0}'), 0.0
+        if zone not in (None, 'Z', 'UTC'):
+            size = int(zone[1:3]) * 3600.0 + int(zone[3:].lstrip(':') or 0) * 60.0
+            offset = -size if zone[0] == '-' else size
+        whole = day + hour * 3600.0 + int(minute) * 60.0 + int(second or 0)
+        seconds[k] = whole - offset + fraction
+    return seconds
 
 
 @lru_cache(maxsize=64)
@@ -265,7 +259,7 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
         raise InputError(f'{path} is empty, expected a header line {_EXAMPLE}',
                          'check that this is the intended file')
     finder = _Finder(head, is_header)
-    found = finder.named() or finder.unnamed() or finder.narrow()
+    found = finder.named() or finder.unnamed()
     if found is None:
         raise InputError(f'{path} has no table of numbers in its first '
                          f'{counted(len(head), "line")}, expected a header line {_EXAMPLE}',
@@ -275,9 +269,13 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
     below = [k for k in cells if k >= first]
     start = next((k for k in below if any(map(_LIKE_NUMBER.fullmatch, cells[k]))),
                  below[0] if below else len(head))
-    rate_hz = None if header else _rate_below_start([cells[k] for k in below if k >= start][:2])
-    if rate_hz is not None and len(below) > 2:
-        start = below[2]
+    values = [{float(cell) for cell in cells[k]} if all(map(is_number, cells[k])) else set()
+              for k in below[below.index(start):][:2]] if below else []
+    rate_hz = None
+    if not header and [*map(len, values)] == [1, 1] and len(cells[start]) >= len('xyz'):
+        (begun,), (rate,) = values  # Empatica writes the time and the rate into each column
+        if begun > EPOCH_S[0] and RATES_HZ[0] <= rate <= RATES_HZ[1]:
+            rate_hz, start = rate, below[2] if len(below) > 2 else start
     passed = [short(head[k]) for k in finder.plain if k < start and k != at]
     skipped = f'skipped {counted(len(passed), "line")} before the table'
     notes = [f'{skipped}{":" if len(passed) == 1 else ", the first is"} {each!r}'
@@ -291,19 +289,11 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
         rate_hz = stated.pop()
     decimal = {match[1] for row in rows[:_TRIED_LINES] for match in map(_DECIMAL.fullmatch, row)
                if match}
-    return Layout(path, dialect, min(decimal, default=''), header, units_row,
-                  _width(header, rows), start, encoding, _about(path, head), tuple(notes),
-                  tuple(map(tuple, rows[:_TRIED_LINES])), rate_hz)
-
-
-def _rate_below_start(rows: Sequence[Sequence[str]]) -> float | None:
-    """Return the rate [Hz] that Empatica writes into each column below the start since 1970."""
-    values = [{float(cell) for cell in row} if all(map(is_number, row)) else set()
-              for row in rows]
-    if len(values) < 2 or any(len(each) != 1 for each in values) or len(rows[0]) < len('xyz'):
-        return None
-    (begun,), (rate_hz,) = values
-    return rate_hz if begun > EPOCH_S[0] and RATES_HZ[0] <= rate_hz <= RATES_HZ[1] else None
+    return Layout(
+        path=path, dialect=dialect, decimal=min(decimal, default=''), header=header,
+        units_row=units_row, width=_width(header, rows), start=start, encoding=encoding,
+        about=_about(path, head), notes=tuple(notes),
+        sample=tuple(map(tuple, rows[:_TRIED_LINES])), rate_hz=rate_hz)
 
 
 _Found = tuple[Dialect, tuple[str, ...], int, int]
@@ -349,7 +339,12 @@ class _Finder:
         return [] if len(cells) < 3 or any(map(_LIKE_NUMBER.fullmatch, cells)) else cells
 
     def unnamed(self) -> _Found | None:
-        """Return the dialect in which most lines are rows of numbers, and their names, if any."""
+        """
+        Return the dialect in which most lines are rows of numbers, and their names, if any.
+
+        If the table has too few columns, the first line has the names.
+
+        """
         step = max(1, len(self.plain) // _TRIED_LINES)
         lines = [self.head[k] for k in self.plain[::-step]]
         tried = []
@@ -359,7 +354,13 @@ class _Finder:
             for (width, others), count in widths.most_common(1):
                 tried.append((count, -others, width, dialect))
         if not tried:
-            return None
+            dialect = Dialect(',')
+            cells = [dialect.cells(self.head[k]) for k in self.plain]
+            numbers = [any(map(_LIKE_NUMBER.fullmatch, row)) for row in cells]
+            if not any(numbers):
+                return None
+            first, names = self.plain[0], () if numbers[0] else tuple(cells[0])
+            return dialect, names, first, first + len(names[:1])
         _, _, width, dialect = max(tried, key=lambda each: each[:2])
         first = next((k for k in self.plain
                       if _row_width(dialect.cells(self.head[k]))[0] == width), self.plain[-1])
@@ -372,17 +373,6 @@ class _Finder:
         before = ((k, self._names(k, dialect)) for k in reversed(self.filled) if k < first)
         return next(((dialect, tuple(cells), k, first) for k, cells in before
                      if len(cells) == width), (dialect, (), -1, first))
-
-    def narrow(self) -> _Found | None:
-        """Return the first line as the names of a table with too few columns, or None."""
-        dialect = Dialect(',')
-        cells = {k: dialect.cells(self.head[k]) for k in self.plain}
-        numbers = [k for k in cells if any(map(_LIKE_NUMBER.fullmatch, cells[k]))]
-        if not numbers:
-            return None
-        first = self.plain[0]
-        names = () if numbers[0] == first else tuple(cells[first])
-        return dialect, names, first, first + 1 if names else first
 
 
 def _row_width(cells: Sequence[str]) -> tuple[int, int]:

@@ -46,11 +46,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .autopilot import (
-    ardupilot_correction, at, ByAxis, choose, FlightLog, Message, Parameters, px4_correction,
-    px4_slot, sound, UnknownCorrectionError, Values, vectors)
+    ardupilot_correction, at, choose, FlightLog, Message, Parameters, px4_correction, px4_slot,
+    sound, vectors)
 from .names import MICRO, PX4_FIELDS, PX4_SPANS
 from ..errors import InputError
-from ..table import Autopilot, Floats
+from ..table import Autopilot
 from ..text import counted
 
 PX4_MESSAGES, ARDUPILOT_MESSAGES = tuple(PX4_FIELDS), ('IMU', 'ACC')
@@ -63,7 +63,7 @@ _INVALID = 0x7fffffff
 """Relative timestamp of sensor_combined without a valid sample of the accelerometer."""
 
 _RELATIVE = 'accelerometer_timestamp_relative'
-_RAW, _FILTERED = 'sensor_accel', 'vehicle_acceleration'
+_RAW = 'sensor_accel'
 _MORE = {'sensor_combined': (_RELATIVE,), 'vehicle_imu': tuple(PX4_SPANS.values())}
 _NEEDED = {name: {*chain(*fields.values()), *_MORE.get(name, ())}
            for name, fields in PX4_FIELDS.items()}
@@ -100,7 +100,19 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
              if message.name in _NEEDED and _NEEDED[message.name] <= set(message.fields)]
     choice = choose(known, PX4_MESSAGES, topic, sensor, str(path))
     chosen = choice.message
-    columns, invalid = _px4_samples(chosen)
+    fields, time = chosen.fields, chosen.time
+    columns = {key: vectors(fields, names) for key, names in PX4_FIELDS[chosen.name].items()}
+    valid = np.ones(len(time), dtype=bool)
+    if _RELATIVE in fields:
+        relative = fields[_RELATIVE].astype(float)
+        time, valid = time + relative * MICRO, relative != _INVALID
+    for key, name in PX4_SPANS.items():
+        if name in fields:
+            seconds = fields[name] * MICRO
+            valid &= seconds > 0.0
+            columns[key] /= np.where(seconds > 0.0, seconds, 1.0)[:, np.newaxis]
+    columns, invalid = sound(
+        chosen, {'time': time, **columns}, 'PX4 marks them as invalid', valid)
     time = columns['time']
     if not len(time):
         raise InputError(f'{path}: no row of {chosen} is valid, expected samples',
@@ -121,12 +133,7 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     stated = [values for _, _, values in parameters.spans()]
     autopilot = Autopilot('px4', px4_slot(stated, device), device or None,
                           px4_slot(stated, device, 'TC_A'))
-
-    def correction(values: Values) -> ByAxis:
-        if chosen.name == _FILTERED:
-            raise UnknownCorrectionError(f'{chosen.name} lacks the bias that PX4 estimates')
-        return px4_correction(parameters, autopilot, release, values)
-
+    correction = partial(px4_correction, parameters, autopilot, release, chosen.name)
     return choice.log(columns, autopilot, parameters, None if is_raw else correction,
                       (*notes, *invalid))
 
@@ -156,22 +163,6 @@ def _px4_messages(path: Path
     stated = chain(((0, *each) for each in log.initial_parameters.items()), log.changed_parameters)
     return found, Parameters(stated, MICRO), (
         (release >> 24, release >> 16 & 0xff) if isinstance(release, int) else None), notes
-
-
-def _px4_samples(message: Message) -> tuple[dict[str, Floats], list[str]]:
-    """Return time, readings and rates of the valid rows, and a note on the others."""
-    fields, time = message.fields, message.time
-    columns = {key: vectors(fields, names) for key, names in PX4_FIELDS[message.name].items()}
-    valid = np.ones(len(time), dtype=bool)
-    if _RELATIVE in fields:
-        relative = fields[_RELATIVE].astype(float)
-        time, valid = time + relative * MICRO, relative != _INVALID
-    for key, name in PX4_SPANS.items():
-        if name in fields:
-            seconds = fields[name] * MICRO
-            valid &= seconds > 0.0
-            columns[key] /= np.where(seconds > 0.0, seconds, 1.0)[:, np.newaxis]
-    return sound(message, {'time': time, **columns}, 'PX4 marks them as invalid', valid)
 
 
 def _device(chosen: Message, found: Sequence[Message] = ()) -> int:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 import io
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 import re
 from typing import Any
@@ -28,14 +28,14 @@ import numpy as np
 from . import containers
 from .autopilot import FlightLog
 from .bag import open_bag
-from .bag_samples import context_of, imu_samples, rate_words
+from .bag_samples import context_of, FIRST_MESSAGES, imu_samples
 from .child import LogFile, parts_of
 from .columns import Chosen, LogOptions
 from .containers import Frame, Member, Piped, Stream
 from .dialect import shown
 from .flight import DATAFLASH, read_dataflash, read_ulg
 from .names import meaning, record_instead
-from .quantities import are_samples, are_untimed_samples, decided, Quantities
+from .quantities import are_samples, decided
 from .text import PEEKED, text_table, TextTable
 from ..disk import check_regular, FIRST_LINE
 from ..errors import DamagedLogError, InputError, needing, saying
@@ -101,10 +101,17 @@ def _bag(_: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
         notes = [*bag.notes, *notes]
         blocks = imu_samples(bag, topic, sensor, chosen=bool(options.sensor), context=context,
                              notes=notes)
+        received = [stamp for _, stamp, _ in bag.first(topic, size=FIRST_MESSAGES)]  # [ns]
+        span = max(received, default=0) - min(received, default=0)
+        rate = f' at {(len(received) - 1) * 1e9 / span:.3g} Hz' if span else ''
         # Drivers exist that publish g, although Imu messages are in m/s².
         units = units_of(options.units or options.default_units or 'm/s2', options.gravity)
-        yield OpenLog(_checked(bag.path, blocks, units), bag.count(topic), units, sensor,
-                      f'Imu messages of {topic}{rate_words(bag, topic)} in {units.name}',
+        read_as = f'Imu messages of {topic}{rate} in {units.name}'
+        with saying(read_as):
+            head = list(islice(blocks, 1))
+            for first in head:
+                check_units(first, units, str(bag.path))
+        yield OpenLog(chain(head, blocks), bag.count(topic), units, sensor, read_as,
                       noted=lambda: tuple(notes))
 
 
@@ -117,16 +124,10 @@ def _flight(known: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLo
     if options.units not in ('', units.name):
         raise InputError(f'{path} is in {units.name}, but --units is {options.units}',
                          'remove --units')
-    yield OpenLog(_checked(path, iter((recording,)), units), len(recording), units,
-                  recording.sensor, log.read_as, noted=lambda: log.notes)
-
-
-def _checked(path: Path, blocks: Iterator[Recording], units: Units) -> Iterator[Recording]:
-    """Yield the blocks, and check the unit of the first one."""
-    for first in blocks:
-        check_units(first, units, str(path))
-        yield first
-        yield from blocks
+    with saying(log.read_as):
+        check_units(recording, units, str(path))
+    yield OpenLog(iter((recording,)), len(recording), units, recording.sensor, log.read_as,
+                  noted=lambda: log.notes)
 
 
 # ------------------------------------------------------------------------------- binary files
@@ -243,47 +244,41 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     if quantities.clock.newest_first:
         first, *rest = (each.take(slice(None, None, -1)) for each in [first, *cells][::-1])
         cells = iter(rest)
-
-    def converted() -> Iterator[Poses]:
-        for block in chain((first,), cells):
-            columns, row = quantities.columns(block)
-            check_values(columns, str(path), partial=bool(text.columns.context))
-            yield Poses(columns, row, **{**text.layout.about, 'units': quantities.units.name})
-
-    blocks, poses = converted(), None
+    about = {**text.layout.about, 'units': quantities.units.name}
+    blocks = (Poses(*quantities.columns(block, str(path), partial=bool(text.columns.context)),
+                    **about) for block in chain((first,), cells))
+    poses = None
     samples: Iterator[Recording]
-    with saying(quantities.read_as):
+    with saying(', '.join(quantities.said)):
         head = next(blocks)
         check_units(head, quantities.units, str(path))
-        if are_samples(head.columns):
-            samples = (block.as_recording() for block in chain((head,), blocks))
+        if 'time' in head and are_samples(head.columns):
+            samples = (Recording(**vars(block)) for block in chain((head,), blocks))
             count = len(head)
             if text.more:  # the size of the file, and the rows of this block, tell about how many
                 width = 2 if text.layout.encoding.startswith('utf-16') else 1
                 count = max(count, int(text.size / width / max(text.characters, 1) * count))
         else:
-            poses = _pose_table(path, concatenated([head, *blocks]), quantities,
-                                partial=options.partial)
+            rows = concatenated([head, *blocks])
+            lacking = [] if options.partial else [
+                key for key in (*CONTEXT, *rows.quantities)
+                if key in rows and not np.isfinite(rows[key]).all()]
+            if lacking:
+                quantities.notes.append(
+                    f'not used, because cells are not numbers: {some(lacking)}')
+            if 'time' not in rows and are_samples(rows.columns):
+                raise InputError(
+                    f'{path} has no times, but its {len(rows)} rows look like samples of a '
+                    'recording, expected a column time', 'state the samples per second with '
+                    '--rate HZ, or name the column with --columns time=NAME; if each row is a '
+                    'pose, add a column orientation')
+            poses = replace(rows.without_columns(*lacking), findings=tuple(quantities.findings))
             samples, count = _as_samples(path, poses), len(poses)
-    rate = '' if quantities.rate_hz is None else f'{quantities.rate_hz:g} Hz (stated)'
-    return OpenLog(samples, count, quantities.units, head.sensor,
-                   ', '.join(filter(None, (quantities.read_as, rate))), poses,
-                   noted=lambda: (*text.notes, *quantities.all_notes),
-                   findings=tuple(quantities.findings))
-
-
-def _pose_table(path: Path, poses: Poses, quantities: Quantities, *, partial: bool) -> Poses:
-    """Return rows as poses, without quantities that are not numbers; refuse samples."""
-    lacking = [] if partial else [key for key in (*CONTEXT, *poses.quantities)
-                                  if key in poses and not np.isfinite(poses[key]).all()]
-    if lacking:
-        quantities.notes.append(f'not used, because cells are not numbers: {some(lacking)}')
-    if are_untimed_samples(poses.columns):
-        raise InputError(
-            f'{path} has no times, but its {len(poses)} rows look like samples of a recording, '
-            'expected a column time', 'state the samples per second with --rate HZ, or name the '
-            'column with --columns time=NAME; if each row is a pose, add a column orientation')
-    return replace(poses.without_columns(*lacking), findings=tuple(quantities.findings))
+    rate = [] if quantities.rate_hz is None else [f'{quantities.rate_hz:g} Hz (stated)']
+    return OpenLog(
+        blocks=samples, samples=count, units=quantities.units, sensor=head.sensor,
+        read_as=', '.join([*quantities.said, *rate]), poses=poses,
+        noted=lambda: (*text.notes, *quantities.all_notes), findings=tuple(quantities.findings))
 
 
 def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:
@@ -291,7 +286,7 @@ def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:
     if 'time' not in poses:
         raise InputError(f'{path} has no column time, expected a recording', 'add the times of '
                          'the samples, or name their column with --columns time=NAME')
-    yield poses.as_recording()
+    yield Recording(**vars(poses))
 
 
 # ---------------------------------------------------------------------------------- formats
@@ -373,12 +368,12 @@ FORMATS = (
     Format('a Feather file', ('.feather', '.arrow'), b'ARROW1',
            partial(containers.columnar, 'ipc'), 'pyarrow'),
     Format('JSON lines', ('.jsonl', '.ndjson'), rb'\s*\{[^\n]*\}\s*\n\s*\{',
-           partial(containers.lines, containers.json_line), plain=True),
+           partial(containers.lines, 'json'), plain=True),
     Format('a JSON file', ('.json',), rb'\s*(?:\{\s*"|\[\s*(?:\{|\[\s*[-"\d]))',
            containers.json_document, plain=True),
     Format('lines of InfluxDB', ('.lp',), rb'(?:#[^\n]*\n)*[^\s,=]+(?:,[^\s=]+=[^\s]+)* '
-           rb'[^\s=]+=[-\d.]+[iu]?(?:,[^\s=]+=[^\s]+)* \d{9,19}\s', partial(
-               containers.lines, containers.influx_line), plain=True),
+           rb'[^\s=]+=[-\d.]+[iu]?(?:,[^\s=]+=[^\s]+)* \d{9,19}\s',
+           partial(containers.lines, 'influx'), plain=True),
     Format('a log of the Betaflight blackbox', ('.bbl', '.bfl'),
            b'H Product:Blackbox flight data recorder', advice='decode it with blackbox_decode {}'),
     Format('a telemetry log of MAVLink', ('.tlog',), b'', advice='use the .bin log of the '

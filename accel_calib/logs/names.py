@@ -66,13 +66,13 @@ OTHER_WORDS = frozenset((
     'setpoint', 'jerk', 'norm', 'error', 'clip', 'angular', 'gps', 'baro', 'pressure'))
 """Words of quantities that are not read."""
 
-CAUSES = frozenset((
-    'mag', 'magn', 'magnetic', 'magnetometer', 'compass', 'angle', 'position', 'pos', 'bias',
-    'offset', 'setpoint', 'gps', 'baro', 'pressure'))
-"""Those of `OTHER_WORDS` that neither the readings nor the orientation determine."""
-
 FREE_WORDS = frozenset(('user', 'free', 'nograv', 'nogravity', 'world'))
 """Words of an acceleration without gravity."""
+
+COMPUTED_WORDS = FREE_WORDS | OTHER_WORDS - {
+    'mag', 'magn', 'magnetic', 'magnetometer', 'compass', 'angle', 'position', 'pos', 'bias',
+    'offset', 'setpoint', 'gps', 'baro', 'pressure'}
+"""Words of quantities that the readings or the orientation determine, which are no causes."""
 
 WHOLE_WORDS = frozenset(('total', 'withgravity'))
 """Words of an acceleration with gravity, where its maker also has one without."""
@@ -168,14 +168,6 @@ def unit_of(quantity: str, text: str) -> tuple[str, float] | None:
     return UNITS.get(quantity, {}).get(re.sub(r'[\s^*·.⋅_()\ufffd]', '', text))
 
 
-def may_cause(name: str) -> bool:
-    """Return whether a column can be a cause, other than what is computed from the readings."""
-    known = meaning(name)
-    computed = OTHER_WORDS - CAUSES | FREE_WORDS
-    return (known.quantity not in ('reading', 'rate', 'time')
-            and bare_name(name) not in COUNTERS and computed.isdisjoint(known.group))
-
-
 @lru_cache(maxsize=4096)
 def meaning(name: str) -> Meaning:
     """Return what the name of a column means."""
@@ -184,8 +176,8 @@ def meaning(name: str) -> Meaning:
     text = text.replace('μ', 'u').replace('ω', 'w')
     brackets = [inner.strip() for inner in _BRACKET.findall(text)]
     words = [word.casefold() for word in _WORD.findall(_BRACKET.sub(' ', text))]
-    axis, words = _axis(_parted(words), brackets)
-    unit = next((each for each in brackets if is_unit(each)), '')
+    axis, words = _part_axis(words, brackets)
+    unit = next((each for each in brackets if any(unit_of(key, each) for key in UNITS)), '')
     quantity = _quantity(words, unit)
     if not unit:
         unit, words = _unit_in(quantity, words)
@@ -200,13 +192,8 @@ def bare_name(name: str) -> str:
     return re.sub(r'[\W_]', '', name[:_LONGEST_NAME]).casefold()
 
 
-def is_unit(text: str) -> bool:
-    """Return whether a text is a unit of any quantity."""
-    return any(unit_of(quantity, text) for quantity in UNITS)
-
-
-def _parted(words: list[str]) -> list[str]:
-    """Return words with axes parted from them, and with pairs of words joined."""
+def _part_axis(words: list[str], brackets: Sequence[str]) -> tuple[int | None, list[str]]:
+    """Return the axis that words or brackets name, and the other words, pairs of them joined."""
     if words[:2] in (['g', 'fx'], ['g', 'fy'], ['g', 'fz']):
         words = ['gf', words[1][1], *words[2:]]
     words = [part for word in words for part in _FUSED_KINDS.get(word, (word,))]
@@ -218,19 +205,13 @@ def _parted(words: list[str]) -> list[str]:
             joined[-1] = PAIRS[joined[-1], word]
         else:
             joined.append(word)
-    return joined
-
-
-def _axis(words: list[str], brackets: Sequence[str]) -> tuple[int | None, list[str]]:
-    for k, word in reversed([*enumerate(words)]):
-        if word in _AXES:
-            return _AXES[word], words[:k] + words[k + 1:]
-    for inner in map(str.casefold, brackets):
-        if inner in _NUMBERED:
-            return _NUMBERED[inner], words
-    if len(words) > 1 and words[-1] in _NUMBERED:
-        return _NUMBERED[words[-1]], words[:-1]
-    return None, words
+    lettered = [k for k, word in enumerate(joined) if word in _AXES]
+    if lettered:
+        return _AXES[joined.pop(lettered[-1])], joined
+    numbered = [_NUMBERED[each] for each in map(str.casefold, brackets) if each in _NUMBERED]
+    if not numbered and len(joined) > 1 and joined[-1] in _NUMBERED:
+        numbered = [_NUMBERED[joined.pop()]]
+    return (numbered[0] if numbered else None), joined
 
 
 def _quantity(words: Sequence[str], unit: str) -> str:
@@ -355,10 +336,10 @@ _TOOLBOX = LogFormat('physics-toolbox', {'time': 'time', **_axes('gF{}'), **dict
 
 _LOGGER = LogFormat(
     'sensor-logger', {'time': 'seconds_elapsed', **_axes('{}')}, {'time': 1.0}, '', ('time',),
-    ('Accelerometer.csv',),
-    ('Gravity.csv', 'Gyroscope.csv', 'GyroscopeUncalibrated.csv', 'Magnetometer.csv',
-     'MagnetometerUncalibrated.csv'),
-    'use TotalAcceleration.csv (Android) or AccelerometerUncalibrated.csv of Sensor Logger',
+    without_gravity=('Accelerometer.csv',),
+    other_sensors=('Gravity.csv', 'Gyroscope.csv', 'GyroscopeUncalibrated.csv', 'Magnetometer.csv',
+                   'MagnetometerUncalibrated.csv'),
+    record='use TotalAcceleration.csv (Android) or AccelerometerUncalibrated.csv of Sensor Logger',
     note='Readings in g are those of an iPhone, with the opposite sign: a flat pose needs '
          '--frame win8.')
 
@@ -437,21 +418,19 @@ _ARDUPILOT_FORMATS = tuple(
 
 _BLACKBOX_TIMES = {'time (us)': MICRO, 'time (ms)': MILLI, 'time (s)': 1.0, 'time': MICRO}
 _BLACKBOX_UNITS: dict[str, UnitName] = {'': 'native', ' (g)': 'g', ' (m/s/s)': 'm/s2'}
-_BLACKBOX_RATES = {' (deg/s)': DEGREE_RAD, ' (rad/s)': 1.0, '': 0.0}
+_BLACKBOX_RATES: tuple[tuple[dict[str, str], float], ...] = (
+    (_axes('gyroADC[{}] (deg/s)', RATE, _BY_NUMBER), DEGREE_RAD),
+    (_axes('gyroADC[{}] (rad/s)', RATE, _BY_NUMBER), 1.0), ({}, 0.0))
 
 
-def _betaflight(time: str, unit: str, rate: str) -> LogFormat:
-    """Return the layout with these units in the names of its columns."""
-    columns = {'time': time, **_axes('accSmooth[{}]' + unit, names=_BY_NUMBER)}
-    turns = _axes('gyroADC[{}]' + rate, RATE, _BY_NUMBER) if rate else {}
-    scales = {'time': _BLACKBOX_TIMES[time], 'rate': _BLACKBOX_RATES[rate]}
-    note = '' if unit else 'Readings are counts, acc_1G of the header of the log to the g.'
-    return LogFormat('betaflight', columns | turns, scales, _BLACKBOX_UNITS[unit],
-                     tuple(turns.values()) or ('loopIteration',), note=note)
-
-
-_BETAFLIGHT_FORMATS = tuple(_betaflight(time, unit, rate) for time in _BLACKBOX_TIMES
-                            for unit in _BLACKBOX_UNITS for rate in _BLACKBOX_RATES)
+_BETAFLIGHT_FORMATS = tuple(
+    LogFormat('betaflight',
+              {'time': time, **_axes('accSmooth[{}]' + ending, names=_BY_NUMBER), **turns},
+              {'time': seconds, 'rate': rate}, units, tuple(turns.values()) or ('loopIteration',),
+              note='' if ending else
+              'Readings are counts, acc_1G of the header of the log to the g.')
+    for time, seconds in _BLACKBOX_TIMES.items() for ending, units in _BLACKBOX_UNITS.items()
+    for turns, rate in _BLACKBOX_RATES)
 
 # ------------------------------------------------------------------- ESP32 and Arduino
 # A sketch prints the names and units that its author chose, so that the table of names finds the

@@ -6,7 +6,7 @@ Quantities of a text log: the conversion of its columns to our units.
 
 `decided` looks at the first block of numbers and decides the unit of each column: what the user,
 a comment of the file, the maker's layout or the name states, in this order, or else what the
-readings at rest and the rate of the samples show. Each assumption is in `Quantities.read_as`.
+readings at rest and the rate of the samples show. Each assumption is in `Quantities.said`.
 
 A sensor at rest reads 1 g plus its offset, in any direction. So the readings at rest lie on a
 sphere whose radius is 1 g in the unit of the sensor. Without gravity they lie around 0, and no
@@ -25,14 +25,14 @@ from typing import Any, cast, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import Chosen, LogOptions, OF_POSES, unused
-from .dialect import Cells
+from .columns import Chosen, LogOptions, MOST, OF_POSES
+from .dialect import Cells, shown
 from .names import DEGREE_RAD, meaning, READING, record_instead, unit_of, ZEROS
 from .times import Clock, clock_of
 from ..errors import InputError, saying
 from ..finding import Finding
 from ..geometry import sphere_through
-from ..table import COLUMNS, Floats
+from ..table import check_values, COLUMNS, Floats
 from ..text import one_line
 from ..units import STANDARD_GRAVITY, UnitName, Units, units_of
 
@@ -134,11 +134,6 @@ class Quantities:
     findings: list[Finding] = field(default_factory=list)
 
     @property
-    def read_as(self) -> str:
-        """Return what is assumed, in one line."""
-        return ', '.join(self.said)
-
-    @property
     def all_notes(self) -> tuple[str, ...]:
         """Return what is not used, and whether the counter of the clock started again."""
         starts = self.clock.starts
@@ -146,8 +141,9 @@ class Quantities:
         again = f'the clock starts again {times} at the end of its range; its times are continued'
         return (*self.notes, again) if starts else tuple(self.notes)
 
-    def columns(self, cells: Cells) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:
-        """Return the columns of a block in our units, and its row numbers."""
+    def columns(self, cells: Cells, source: str, *, partial: bool = False
+                ) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:
+        """Return the columns of a block in our units, and its row numbers; see `check_values`."""
         cells = self.of_sensor(cells)
         columns: dict[str, NDArray[Any]] = {}
         for key, own in self.chosen.sources.items():
@@ -164,6 +160,7 @@ class Quantities:
         columns |= {key: cells.numbers[k] for key, k in self.chosen.quantities.items()}
         if self.rate_hz is not None:
             columns['time'] = (cells.row - 1) / self.rate_hz
+        check_values(columns, source, partial=partial)
         return columns, cells.row
 
     def of_sensor(self, cells: Cells) -> Cells:
@@ -175,7 +172,9 @@ class Quantities:
     def numbers(self, cells: Cells, key: str) -> Floats:
         """Return the numbers of a key, (n, k), with their sign, in the unit of the file."""
         values = self.chosen.numbers(cells, key)
-        return with_sign(values, self.modulus[key]) if key in self.modulus else values
+        if key in self.modulus:
+            values[values >= self.modulus[key] / 2.0] -= self.modulus[key]
+        return values
 
 
 @np.errstate(over='ignore', invalid='ignore')  # numbers beyond any sensor are refused later
@@ -210,7 +209,7 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
         made.notes += made.clock.doubts
         samples = are_samples({**there, 'time': made.clock.seconds(first)})
     else:
-        samples = bool(options.rate) or are_untimed_samples(there)
+        samples = bool(options.rate) or are_samples(there)
         made.rate_hz = options.rate or (columns.layout.rate_hz if samples else None)
     made.clock.newest_first &= samples  # rows of poses keep their numbers
     if 'time' in there and (samples or columns.names('time') != ['time']):
@@ -218,7 +217,6 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
     _decide_reading(made, first, options, samples=samples)
     _decide_rate(made, first)
     _decide_context(made, first)
-    made.notes += unused(columns)
     made.findings += made.clock.findings
     return made
 
@@ -252,14 +250,10 @@ def modulus_of(values: Floats) -> float:
     modulus = 2.0**bits
     apart = np.abs(values / modulus - 0.5)
     jumps = np.abs(np.diff(values, axis=0)).sum()
-    steps = np.abs(np.diff(with_sign(values, modulus), axis=0)).sum()
+    signed = np.where(values >= modulus / 2.0, values - modulus, values)
+    steps = np.abs(np.diff(signed, axis=0)).sum()
     empty = largest > _NEAR_TOP * modulus and np.mean(apart < _MIDDLE) < _IN_MIDDLE
     return modulus if empty and steps < _SMOOTHER * jumps else 0.0
-
-
-def with_sign(values: Floats, modulus: float) -> Floats:
-    """Return numbers below a modulus as numbers with a sign."""
-    return np.where(values >= modulus / 2.0, values - modulus, values)
 
 
 def _instance(columns: Chosen, first: Cells, options: LogOptions, notes: list[str]) -> float:
@@ -442,24 +436,20 @@ def _quiet_windows(reading: Floats, *beside: Floats) -> list[Floats]:
 
 
 def are_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
-    """Return whether rows are samples: with time, not marked as poses, and dense or many."""
-    if 'time' not in columns or OF_POSES & columns.keys() or len(columns['time']) < 2:
-        return False
-    apart = abs(float(np.median(np.diff(columns['time']))))
-    return apart < _SAMPLES_APART_S or len(columns['time']) > _MOST_POSES
-
-
-def are_untimed_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
     """
-    Return whether rows without times are samples.
+    Return whether rows are samples: not marked as poses, and dense in time or many.
 
-    They are if a person does not take as many poses, or if they are many and have angular rates,
-    are mostly like the row before, all have about the same direction, or are on no sphere.
+    Rows without times are if a person does not take as many poses, or if they are many and have
+    angular rates, are mostly like the row before, all have about the same direction, or are on no
+    sphere.
 
     """
     readings = columns['reading']
-    if len(readings) < _FEW_POSES or ({'time'} | OF_POSES) & columns.keys():
+    if OF_POSES & columns.keys() or len(readings) < (2 if 'time' in columns else _FEW_POSES):
         return False
+    if 'time' in columns:
+        apart = abs(float(np.median(np.diff(columns['time']))))
+        return apart < _SAMPLES_APART_S or len(readings) > _MOST_POSES
     step = np.linalg.norm(np.diff(readings, axis=0), axis=1)
     middle = np.median(readings, axis=0)
     spread = np.median(np.linalg.norm(readings - middle, axis=1))
@@ -547,3 +537,8 @@ def _decide_context(made: Quantities, first: Cells) -> None:
                 _leave_out(made, key, f'the temperature {source.name} has values of about '
                            f'{middle:.4g} in a unit that is not known, and is',
                            'state its unit in the name, such as temperature_K')
+    names = [name for name in columns.layout.header[:MOST]
+             if meaning(name).quantity == 'temperature']
+    if names and 'temperature' not in columns.sources:
+        made.notes.append(f'not used, though the names look like temperatures: {shown(names)}; '
+                          f'choose one with --columns temperature={names[0]}')

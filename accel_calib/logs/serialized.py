@@ -17,7 +17,7 @@ endian if the second byte of the encapsulation is 1.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import struct
 from typing import Any
 
@@ -153,7 +153,7 @@ def joined(raws: Sequence[bytes | memoryview], doubles: int, name: str, *, ros2:
     data = np.frombuffer(bytearray().join(raws), np.uint8)
     size = stop - start
     _check(size >= LETTERS_AT + 8 * doubles, size, name, before)
-    head = _rows_at(data, start, LETTERS_AT).view('<u4')
+    head = sliding_window_view(data, LETTERS_AT)[start].view('<u4')
     swapped = np.zeros(len(raws), dtype=bool)
     if ros2:
         swapped = head[:, 0] & 0xffff == 0
@@ -164,7 +164,8 @@ def joined(raws: Sequence[bytes | memoryview], doubles: int, name: str, *, ros2:
     extra = size - begin - 8 * doubles
     # A CDR message may end with up to 3 bytes of padding.
     _check((extra >= 0) & (extra <= (3 if ros2 else 0)), size, name, before)
-    return Messages(data, start, stop, head, start + begin, swapped, ros2)
+    return Messages(data=data, start=start, stop=stop, head=head, begin=start + begin,
+                    swapped=swapped, ros2=ros2)
 
 
 def _check(sound: NDArray[np.bool_], size: Indices, name: str, before: int) -> None:
@@ -186,7 +187,7 @@ def frame_ids(messages: Messages) -> list[str]:
     """Return the frame_id of each message; only one item if all are equal."""
     length, first = messages.head[:, 3].astype(np.int64), messages.start + LETTERS_AT
     if np.all(length == length[0]):
-        names = _rows_at(messages.data, first, int(length[0]))
+        names = sliding_window_view(messages.data, int(length[0]))[first]
         if np.all(names == names[0]):
             length, first = length[:1], first[:1]
     return [messages.data[place:place + size].tobytes().rstrip(b'\0').decode(errors='replace')
@@ -196,7 +197,8 @@ def frame_ids(messages: Messages) -> list[str]:
 def doubles_at(messages: Messages, which: slice) -> Floats:
     """Return a slice of the doubles of each message, (n, k)."""
     width = 8 * (which.stop - which.start)
-    values = _rows_at(messages.data, messages.begin + 8 * which.start, width).view('<f8')
+    begin = messages.begin + 8 * which.start
+    values = sliding_window_view(messages.data, width)[begin].view('<f8')
     if np.any(messages.swapped):
         values[messages.swapped] = values[messages.swapped].byteswap()
     return values
@@ -217,15 +219,15 @@ def renamed(messages: Messages, frame_id: str) -> Messages:
     begin = int(begin_of(len(letters), ros2=messages.ros2))
     size = begin + 8 * IMU_DOUBLES
     rows = np.zeros((len(messages), size), np.uint8)
-    rows[:, :LETTERS_AT] = _rows_at(messages.data, messages.start, LETTERS_AT)
+    rows[:, :LETTERS_AT] = sliding_window_view(messages.data, LETTERS_AT)[messages.start]
     length = np.where(messages.swapped, np.uint32(len(letters)).byteswap(), len(letters))
     rows[:, NAME_AT:LETTERS_AT] = length.astype('<u4')[:, np.newaxis].view(np.uint8)
     rows[:, LETTERS_AT:LETTERS_AT + len(letters)] = np.frombuffer(letters, np.uint8)
-    rows[:, begin:] = _rows_at(messages.data, messages.begin, size - begin)
+    rows[:, begin:] = sliding_window_view(messages.data, size - begin)[messages.begin]
     start, head = np.arange(len(messages)) * size, messages.head.copy()
     head[:, 3] = len(letters)
-    return Messages(rows.ravel(), start, start + size, head, start + begin,
-                    messages.swapped, messages.ros2)
+    return replace(messages, data=rows.ravel(), start=start, stop=start + size, head=head,
+                   begin=start + begin)
 
 
 def samples_of(messages: Messages) -> dict[str, Floats]:
@@ -242,8 +244,3 @@ def samples_of(messages: Messages) -> dict[str, Floats]:
     rate[absent | ~np.isfinite(rate).all(axis=1)] = np.nan
     return {'time': stamps_of(messages), 'reading': doubles_at(messages, ACCELERATION),
             'rate': rate}
-
-
-def _rows_at(data: Bytes, place: Indices, width: int) -> Bytes:
-    """Return the (n, width) bytes that start at each place."""
-    return sliding_window_view(data, width)[place]

@@ -35,7 +35,7 @@ from .dialect import Cells, Dialect, is_clock, is_number, layout_of, short
 from .quantities import decided
 from ..disk import write_atomically
 from ..errors import InputError
-from ..table import check_values, column_of, COLUMNS, Floats, Recording, Table
+from ..table import column_of, COLUMNS, Floats, Recording, Table
 from ..text import counted, one_line
 
 ROWS = 65536
@@ -60,14 +60,23 @@ def text_table(path: Path, options: LogOptions, raw: io.BufferedReader[Any], siz
     """Return the text table of an open file of this size [bytes]; see `layout_of`."""
     encoding = _encoding(raw.peek())
     text = io.TextIOWrapper(raw, encoding, errors='replace', newline=None)
-    head, rows = _head(path, text), iter(text)
+    head, rows, characters = list[str](), iter(text), 0
+    for line in islice(iter(partial(text.readline, _LONGEST_LINE), ''), _HEAD_LINES):
+        if len(line) == _LONGEST_LINE:
+            raise InputError(f'{path} has a line of more than {_LONGEST_LINE} characters, '
+                             'expected a table with one line for each row',
+                             'use a CSV table or a bag')
+        head.append(line)
+        characters += len(line)
+        if characters >= _HEAD_CHARACTERS and len(head) > 1:
+            break
     names = [match[1] for match in map(_ONE_LABEL.fullmatch, head) if match]
     cycle = list(dict.fromkeys(names))  # of numbers that stand one per line
     repeats = len(cycle) >= 3 and names[:3 * len(cycle)] == 3 * cycle
     if repeats and 4 * len(names) > len(head):
         rows = _readings(chain(head, text), cycle[0])
         head = list(islice(rows, _HEAD_LINES))
-    return TextTable(path, head, rows, options, encoding, size)
+    return TextTable(path, head, rows, options, encoding=encoding, size=size)
 
 
 def _readings(lines: Iterable[str], label: str) -> Iterator[str]:
@@ -98,22 +107,6 @@ def _encoding(head: bytes) -> str:
             bad = head.decode('utf-8', errors='replace').count('\ufffd')
             return 'cp1252' if bad < 0.05 * len(head) else 'utf-8'  # of Windows, or garbage
     return 'utf-8'
-
-
-def _head(path: Path, file: io.TextIOWrapper) -> list[str]:
-    """Return the first lines."""
-    lines: list[str] = []
-    characters = 0
-    for line in islice(iter(partial(file.readline, _LONGEST_LINE), ''), _HEAD_LINES):
-        if len(line) == _LONGEST_LINE:
-            raise InputError(f'{path} has a line of more than {_LONGEST_LINE} characters, '
-                             'expected a table with one line for each row',
-                             'use a CSV table or a bag')
-        lines.append(line)
-        characters += len(line)
-        if characters >= _HEAD_CHARACTERS and len(lines) > 1:
-            break
-    return lines
 
 
 class TextTable:
@@ -162,7 +155,12 @@ class TextTable:
         """Return the rows of the next lines; a row that is cut at the last line is left out."""
         dialect, numeric = self.layout.dialect, self.columns.numeric
         kept = list(filter(dialect.is_row, lines))
-        rows = _joined_quotes(kept) if '"' in ''.join(kept) else kept
+        rows, k = ([], 0) if '"' in ''.join(kept) else (kept, len(kept))
+        while k < len(kept):  # a quoted cell can have several lines, at most 20
+            last = min(k + 20, len(kept)) if kept[k].count('"') % 2 else k
+            end = next((j for j in range(k + 1, last) if kept[j].count('"') % 2), k)
+            rows.append(''.join(kept[k:end + 1]))
+            k = end + 1
         is_joined = len(rows) < len(kept)
         number = np.arange(self._row + 1, self._row + len(rows) + 1)
         self._row += len(rows)
@@ -249,18 +247,6 @@ class TextTable:
         return None
 
 
-def _joined_quotes(lines: list[str]) -> list[str]:
-    """Return lines with quoted cells of several lines, at most 20, joined."""
-    joined: list[str] = []
-    k = 0
-    while k < len(lines):
-        last = min(k + 20, len(lines)) if lines[k].count('"') % 2 else k
-        end = next((j for j in range(k + 1, last) if lines[j].count('"') % 2), k)
-        joined.append(''.join(lines[k:end + 1]))
-        k = end + 1
-    return joined
-
-
 # ----------------------------------------------------------------------------- serial ports
 
 class LineReader:
@@ -291,7 +277,7 @@ class LineReader:
                                    replace(options, rate=rate_hz))
         self.units = self._quantities.units
         rate = f'no times, {rate_hz:.4g} Hz ({"stated" if options.rate else "measured"})'
-        self.read_as = ', '.join(filter(None, (self._quantities.read_as, '' if timed else rate)))
+        self.read_as = ', '.join([*self._quantities.said, *(() if timed else (rate,))])
         self.first, self.findings = self._recording(first), tuple(self._quantities.findings)
 
     def samples(self, lines: Sequence[str]) -> Recording | None:
@@ -301,8 +287,7 @@ class LineReader:
     def _recording(self, cells: Cells) -> Recording | None:
         if not len(cells.row):
             return None
-        columns, row = self._quantities.columns(cells)
-        check_values(columns, self._name)
+        columns, row = self._quantities.columns(cells, self._name)
         return Recording(columns, row, self.units.name) if len(row) else None
 
 

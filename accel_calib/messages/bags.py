@@ -96,8 +96,8 @@ def correct_bag(path: Path, calibration: Calibration, out: Path,
         units = units_of(options.units or 'm/s2', options.gravity)
         correction = Correction(on_topics(calibration, calibration.frame), units.name,
                                 known['sensor'])
-        imus = _Imus(path, known, correction, units,
-                     output_scale(correction.calibration, options.gravity))
+        imus = _Imus(path=path, ros2=ros2, known=known, correction=correction, units=units,
+                     scale=output_scale(correction.calibration, options.gravity))
         with _new(out) as folder:
             notes = _copy(imus, parts, folder, out, progress)
     for line in (*notes, *correction.notes):
@@ -107,7 +107,12 @@ def correct_bag(path: Path, calibration: Calibration, out: Path,
 
 @contextmanager
 def _new(out: Path) -> Iterator[Path]:
-    """Yield a new folder next to the target, and remove it and old leftovers of others."""
+    """
+    Yield a new folder next to the target, and remove it and old leftovers of others.
+
+    An OSError has the name of the target; SQLite has an error of its own for a full disk.
+
+    """
     out.parent.mkdir(parents=True, exist_ok=True)
     for each in out.parent.glob(f'.{glob.escape(out.name)}.*{_PARTIAL}'):
         if not each.is_symlink() and time.time() - each.stat().st_mtime > _STALE_S:
@@ -115,6 +120,11 @@ def _new(out: Path) -> Iterator[Path]:
     folder = Path(mkdtemp(_PARTIAL, f'.{out.name}.', out.parent))
     try:
         yield folder
+    except sqlite3.OperationalError as err:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(out)) from err
+    except OSError as err:
+        err.filename = str(out)
+        raise
     finally:
         shutil.rmtree(folder)
 
@@ -124,15 +134,12 @@ class _Imus:
     """The messages of an Imu topic: what `messages_of` says first, and the units recorded."""
 
     path: Path
+    ros2: bool
     known: Mapping[str, Any]
     correction: Correction
     units: Units
     scale: float
     done: int = 0
-
-    @property
-    def ros2(self) -> bool:
-        return self.path.suffix != '.bag'
 
     def corrected(self, raws: Sequence[memoryview]) -> Messages:
         """Return corrected messages in a new buffer."""
@@ -159,7 +166,7 @@ def _copy(imus: _Imus, parts: Iterator[Any], folder: Path, out: Path, progress: 
     target = folder / (out.stem if out.suffix in ('.mcap', '.db3') else out.name)
     imu, written, notes = {*imus.known['imu']}, 0, list[str]()
     writer = _writer(imus, target, out.suffix)
-    with _full_disk(out), writer:
+    with writer:
         with BAG.file(imus.path).refused():
             outputs = _added(imus, writer)
         for block in parts:
@@ -179,18 +186,6 @@ def _copy(imus: _Imus, parts: Iterator[Any], folder: Path, out: Path, progress: 
     _check_copy(imus.path, target, written)
     (target if target.name == out.name else next(target.glob(f'*{out.suffix}'))).rename(out)
     return notes
-
-
-@contextmanager
-def _full_disk(out: Path) -> Iterator[None]:
-    """Raise OSError with the name of the copy; SQLite has an error of its own for a full disk."""
-    try:
-        yield
-    except sqlite3.OperationalError as err:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(out)) from err
-    except OSError as err:
-        err.filename = str(out)
-        raise
 
 
 def _check_copy(path: Path, target: Path, written: int) -> None:

@@ -86,10 +86,9 @@ def corrected(calibration: Calibration, doubles: Floats, context: Mapping[str, N
         x, y, z, w = doubles[present, ORIENTATION].T
         result[present, ORIENTATION] = np.array(_product(x, y, z, w, *quaternion_of(rotation))).T
     turn = rotation.T if calibration.is_levelled else np.eye(3)
-    for part in (ANGULAR_VELOCITY_COVARIANCE, ORIENTATION_COVARIANCE):
-        _transform(result, part, turn)
-    stated = _transform(result, ACCELERATION_COVARIANCE,
-                        scale * rotation.T @ np.linalg.inv(calibration.gain))
+    for part, matrix in ((ANGULAR_VELOCITY_COVARIANCE, turn), (ORIENTATION_COVARIANCE, turn), (
+            ACCELERATION_COVARIANCE, scale * rotation.T @ np.linalg.inv(calibration.gain))):
+        result[:, part], stated = _transformed(matrix, doubles[:, part])
     if np.any(stated):
         rows = {key: values[stated] for key, values in known.items()}
         added = calibration.force_covariance(force[stated], rows)
@@ -102,24 +101,18 @@ def output_frame(calibration: Calibration, frame_id: str, chosen: str = '') -> s
     return (chosen or f'{frame_id}_levelled') if calibration.is_levelled else frame_id
 
 
-def _transform(doubles: Floats, part: slice, matrix: Floats) -> NDArray[np.bool_]:
-    """Transform a covariance of (n, 37) doubles in place; return where it is known."""
-    given = doubles[:, part]
-    absent, known = given[:, 0] == -1.0, is_known(given)
-    doubles[known, part] = transformed(matrix, given[known])
-    doubles[~known & ~absent, part] = 0.0
-    return known
+def _transformed(matrix: Floats, covariance: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """
+    Return A C Aᵀ for (n, 9) covariances C, and which of them are known.
 
+    An unknown covariance becomes zero, and one without data (-1) is unchanged.
 
-def is_known(covariance: Floats) -> NDArray[np.bool_]:
-    """Return which (n, 9) covariances are finite, and neither -1 (no data) nor all zero."""
-    return ((covariance[:, 0] != -1.0) & np.any(covariance != 0.0, axis=1)
-            & np.all(np.isfinite(covariance), axis=1))
-
-
-def transformed(matrix: Floats, covariance: Floats) -> Floats:
-    """Return A C Aᵀ for (n, 9) covariances C."""
-    return (matrix @ covariance.reshape(-1, 3, 3) @ matrix.T).reshape(-1, 9)
+    """
+    absent = covariance[:, 0] == -1.0
+    known = ~absent & np.any(covariance != 0.0, axis=1) & np.all(np.isfinite(covariance), axis=1)
+    found = np.where(absent[:, np.newaxis], covariance, 0.0)
+    found[known] = (matrix @ covariance[known].reshape(-1, 3, 3) @ matrix.T).reshape(-1, 9)
+    return found, known
 
 
 def _product(x: Any, y: Any, z: Any, w: Any, p: float, q: float, r: float, s: float
@@ -200,8 +193,10 @@ class Rewriter:
             ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE))
         self._renamed = self.layout.name != layout.name
         self._name = self.layout.name + bytes(self.layout.begin - self.layout.name_end)
-        self._fill_force = _UNKNOWN if noise is None else _diagonal(noise.force)
-        self._fill_rate = _UNKNOWN if noise is None else _diagonal(noise.rate)
+        stated = [np.full(3, np.nan)] * 2 if noise is None else [noise.force, noise.rate]
+        self._fill_force, self._fill_rate = (
+            np.diag(np.square(each)).astype('<f8').tobytes() if np.all(np.isfinite(each))
+            else _UNKNOWN for each in stated)
         self._seen_force = self._seen_rate = self._seen_orientation = _Seen(b'', True, b'', None)
 
     def __call__(self, data: bytes, context: Mapping[str, float]) -> bytes | None:
@@ -236,7 +231,7 @@ class Rewriter:
 
     def _before(self, data: bytes, given: tuple[Any, ...]) -> bytes:
         """Return the message before the acceleration."""
-        x, y, z, w, orientation_spread, p, q, r, rate_spread = given[:9]
+        attitude, orientation_spread, rate, rate_spread = given[:4], given[4], given[5:8], given[8]
         if rate_spread != self._seen_rate.given:
             self._seen_rate = _seen(self._turn, rate_spread, self._fill_rate)
         if orientation_spread != self._seen_orientation.given:
@@ -244,24 +239,21 @@ class Rewriter:
         _, has_rate, new_rate, _ = self._seen_rate
         _, has_orientation, new_orientation, _ = self._seen_orientation
         u, v, t = self.bias
+        begin = self._given.begin
+        head = (LITTLE_ENDIAN + data[STAMP_AT:NAME_AT] + self._name if self._renamed
+                else data[:begin])
         if not (self._turns or u or v or t or new_rate != rate_spread
                 or new_orientation != orientation_spread):
-            return self._header(data, self._force)
+            return head + data[begin:self._force]
+        p, q, r = rate
         if has_rate:
-            p, q, r = p - u, q - v, r - t
+            p, q, r = rate = p - u, q - v, r - t
         if self._turns:
             if has_orientation:
-                x, y, z, w = _product(x, y, z, w, *self._quaternion)
+                attitude = _product(*attitude, *self._quaternion)
             d, e, f, g, h, i, j, k, m = self._turn
-            p, q, r = d * p + e * q + f * r, g * p + h * q + i * r, j * p + k * q + m * r
-        return self._header(data, self._given.begin) + _FRONT.pack(
-            x, y, z, w, new_orientation, p, q, r, new_rate)
-
-    def _header(self, data: bytes, end: int) -> bytes:
-        """Return the message up to a place, with the new frame_id."""
-        if not self._renamed:
-            return data[:end]
-        return LITTLE_ENDIAN + data[STAMP_AT:NAME_AT] + self._name + data[self._given.begin:end]
+            rate = d * p + e * q + f * r, g * p + h * q + i * r, j * p + k * q + m * r
+        return head + _FRONT.pack(*attitude, new_orientation, *rate, new_rate)
 
     def _at_context(self, data: bytes, context: Mapping[str, float]) -> AtReading:
         """Return the calibration at the context of a message, and cache it."""
@@ -283,22 +275,14 @@ class Rewriter:
         return self._at
 
 
-def _diagonal(deviation: Floats) -> bytes:
-    """Return the covariance of independent axes; unknown if a deviation is not known."""
-    if not np.all(np.isfinite(deviation)):
-        return _UNKNOWN
-    return np.diag(np.square(deviation)).astype('<f8').tobytes()
-
-
 def _seen(matrix: Any, covariance: bytes, fill: bytes) -> _Seen:
     """Return a covariance C with A C Aᵀ, and `fill` in place of an unknown C."""
     if covariance[:8] == _ABSENT:
         return _Seen(covariance, False, covariance, None)
-    for candidate in (covariance, fill):
-        numbers = np.frombuffer(candidate, '<f8')[np.newaxis]
-        if is_known(numbers)[0]:
-            turned = transformed(np.reshape(matrix, (3, 3)), numbers)[0].tolist()
-            return _Seen(covariance, True, NINE.pack(*turned), turned)
+    either = np.frombuffer(covariance + fill, '<f8').reshape(2, 9)
+    found, known = _transformed(np.reshape(matrix, (3, 3)), either)
+    for turned in found[known].tolist():
+        return _Seen(covariance, True, NINE.pack(*turned), turned)
     return _Seen(covariance, True, _UNKNOWN, None)
 
 

@@ -46,7 +46,12 @@ _SLOW = 3
 
 
 class OneReading:
-    """A calibration prepared for the correction of single readings; `scale` is on the force."""
+    """
+    A calibration prepared for the correction of single readings; `scale` is on the force.
+
+    `monomials` are the indices of those of the model; the affine monomials are first.
+
+    """
 
     def __init__(self, calibration: Calibration, scale: float = 1.0) -> None:
         model = calibration.model
@@ -70,6 +75,10 @@ class OneReading:
             else:
                 self._add(terms, None, self._fixed, self._bends)
         self._varying.sort(key=lambda each: each[0].scales)
+        used = model.terms.monomials
+        self.monomials = (*range(AFFINE), *(index for index in used if index >= AFFINE))
+        self._fixed_at = (None if self._varying or self.of_force
+                          else AtReading(self, self._fixed, self._bends, {}))
 
     def _add(self, terms: list[_Term], factor: Any, affine: list[float], bends: list[_Bend]
              ) -> None:
@@ -87,8 +96,8 @@ class OneReading:
 
     def at(self, known: Known) -> AtReading:
         """Return the calibration at a context; a quantity that is missing is an InputError."""
-        if not self._varying and not self.of_force:
-            return self._without_context
+        if self._fixed_at is not None:
+            return self._fixed_at
         check_context(self._calibration.model, known)
         ranges = self._calibration.ranges
         if ranges:  # effects are not extrapolated
@@ -103,10 +112,6 @@ class OneReading:
         return AtReading(self, affine, bends, known)
 
     @cached_property
-    def _without_context(self) -> AtReading:
-        return AtReading(self, self._fixed, self._bends, {})
-
-    @cached_property
     def _spread_rows(self) -> tuple[Floats, Floats]:
         """Return the (m, t) monomial of each row of the basis, and its (t, 3 p) part of a root."""
         model, covariance = self._calibration.model, self._calibration.covariance
@@ -118,12 +123,6 @@ class OneReading:
         monomials = np.take(model.terms.monomials, model.rows.place)
         return (np.equal.outer(self.monomials, monomials).astype(float),
                 (of_axis * root[:, np.newaxis]).reshape(len(root), -1))
-
-    @property
-    def monomials(self) -> tuple[int, ...]:
-        """Return the indices of the monomials of the model; the affine monomials are first."""
-        used = self._calibration.model.terms.monomials
-        return (*range(AFFINE), *(index for index in used if index >= AFFINE))
 
     def spread_basis(self, known: Known, u: Triple) -> Floats:
         """Return the (m, 3 p) basis of each monomial times a root of the covariance."""
@@ -256,7 +255,7 @@ class AtReading:
         both = each + np.swapaxes(each, 0, 1)
         form = np.array([both[m, n] / (2.0 if m == n else 1.0)
                          for m, n in zip(*np.triu_indices(AFFINE), strict=True)])
-        return [_quadratic(*form[:, entry].tolist()) for entry in (0, 1, 2, 4, 5, 8)]
+        return [_quadratic(form[:, entry].tolist()) for entry in (0, 1, 2, 4, 5, 8)]
 
     @cached_property
     def _basis(self) -> Floats:
@@ -267,20 +266,15 @@ def _affine(matrix: Matrix, less: Triple) -> Callable[[float, float, float], Tri
     """Return the function v -> matrix @ v - less."""
     a, b, c, d, e, f, g, h, i = matrix
     p, q, r = less
-
-    def apply(x: float, y: float, z: float) -> Triple:
-        return a * x + b * y + c * z - p, d * x + e * y + f * z - q, g * x + h * y + i * z - r
-
-    return apply
+    return lambda x, y, z: (
+        a * x + b * y + c * z - p, d * x + e * y + f * z - q, g * x + h * y + i * z - r)
 
 
-def _quadratic(a: float, b: float, c: float, d: float, e: float, f: float, g: float, h: float,
-               i: float, j: float) -> Callable[[float, float, float], float]:
+def _quadratic(form: Sequence[float]) -> Callable[[float, float, float], float]:
     """Return the quadratic form with the coefficients of 1, x, y, z, xx, xy, xz, yy, yz, zz."""
-    def apply(x: float, y: float, z: float) -> float:
-        return a + x * (b + e * x + f * y + g * z) + y * (c + h * y + i * z) + z * (d + j * z)
-
-    return apply
+    a, b, c, d, e, f, g, h, i, j = form
+    return lambda x, y, z: (
+        a + x * (b + e * x + f * y + g * z) + y * (c + h * y + i * z) + z * (d + j * z))
 
 
 def _times(matrix: Matrix, x: float, y: float, z: float) -> Triple:

@@ -71,11 +71,11 @@ class Candidate:
         return cls(effect, every, places, max(len(places) / _SHAPES_ALIKE, 1.0),
                    factors_of(effect, [every[place] for place in places], context))
 
-    @property
+    @cached_property
     def shapes(self) -> tuple[Floats, ...]:
         return tuple(self.every[place] for place in self.places)
 
-    @property
+    @cached_property
     def entry(self) -> Effect:
         return entry_of(self.effect)
 

@@ -12,7 +12,7 @@ The residual of each pose before and after a calibration, and its figures.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,10 +25,10 @@ from ..calibration import Calibration, directions_in, errors_after, errors_befor
 from ..effects import (
     acting_temperature, add_history, AXES, EffectKey, entry_of, rate_at, sensor_force)
 from ..geometry import uncovered, unit
-from ..refinement import Refinement, Stage
+from ..refinement import Refinement
 from ..statistics import over_axes, rms
 from ..table import column_of, Floats, Poses
-from ..text import milli, percentage, short, with_minus
+from ..text import milli, short, with_minus
 from ..units import MG
 
 _CONTEXT = ('temperature', 'time', 'supply_voltage', 'std', 'rate')
@@ -140,15 +140,6 @@ class Residuals:
     reasons: Mapping[int, str]
     signed: bool
 
-    @property
-    def rms_mg(self) -> float:
-        """RMS of the residuals with the calibration [mg]."""
-        return rms(self.after_mg)
-
-    def at(self, stage: Stage) -> Residuals:
-        """Return the residuals at a stage of the refinement of these poses."""
-        return replace(self, after_mg=stage.residual_mg)
-
 
 def residuals_of(calibration: Calibration, poses: Poses | None = None) -> Residuals:
     """Return the residuals of a calibration on poses in its unit, by default on its own."""
@@ -176,10 +167,9 @@ def residuals_of_refinement(result: Refinement) -> Residuals:
     before = errors_before(result.poses_g, calibration.units,
                            vectors=not signed and 'reference' in result.poses_g)
     return Residuals(
-        result.poses_g, result.force, before * MG, result.stages[-1].residual_mg, out,
-        directions_in(out, calibration),
-        {int(row): reasons.get(int(row), 'disagrees with the other poses') for row in out.row},
-        signed)
+        result.poses_g, result.force, before * MG, result.stages[-1].residual_mg, left_out=out,
+        left_out_force=directions_in(out, calibration), signed=signed, reasons={
+            row: reasons.get(row, 'disagrees with the other poses') for row in out.row.tolist()})
 
 
 # ----------------------------------------------------------------------------- figures
@@ -194,17 +184,11 @@ def limit_mg(*residuals: Residuals) -> float:
     return max(largest, 1e-9) * 1.08
 
 
-def are_spread(force: Floats) -> bool:
-    """Return whether the poses have enough different directions for a map: 6 or more."""
-    return len(np.unique(np.round(force, 1), axis=0)) >= 6
-
-
 def of_remainder(residuals: Residuals, prefix: str = 'remaining') -> Iterator[Drawing]:
     """Yield figures of the final residuals, over the sphere and against the context."""
     limit = limit_mg(residuals)
-    title = f'Remaining residual: {short(residuals.rms_mg)} mg RMS'
-    if are_spread(residuals.force):
-        yield sphere_map(residuals, f'{prefix}_sphere', title, limit, more=', by direction')
+    title = f'Remaining residual: {short(rms(residuals.after_mg))} mg RMS'
+    yield from sphere_map(residuals, f'{prefix}_sphere', title, limit, more=', by direction')
     poses_g = residuals.poses_g
     recorded = [variable_of(key, poses_g[key]) for key in (*_CONTEXT, *poses_g.quantities)
                 if key in poses_g]
@@ -212,13 +196,20 @@ def of_remainder(residuals: Residuals, prefix: str = 'remaining') -> Iterator[Dr
                  or variables_of('quadratic', poses_g, residuals.force))
     for k in range(0, len(variables), _PANELS):
         yield against(residuals, variables[k:k + _PANELS], f'{prefix}_variables{k or ""}', title,
-                      limit, AFTER)
+                      limit, colour=AFTER)
 
 
 def sphere_map(residuals: Residuals, name: str, title: str, limit: float, *, more: str = ''
-               ) -> Drawing:
-    """Draw residuals over the sphere; `limit` is the end of the colour scale [mg]."""
+               ) -> Iterator[Drawing]:
+    """
+    Yield residuals over the sphere, if the poses have 6 different directions or more.
+
+    `limit` is the end of the colour scale [mg].
+
+    """
     force, values, signed = residuals.force, residuals.after_mg, residuals.signed
+    if len(np.unique(np.round(force, 1), axis=0)) < 6:
+        return
     marks, hover = _marks(residuals), dict[str, Marks]()
     with drawn(HEIGHT_INCHES, title, columns=2, grid='') as (figure, discs):
         for disc, half, up in _hemispheres(discs):
@@ -240,7 +231,7 @@ def sphere_map(residuals: Residuals, name: str, title: str, limit: float, *, mor
             hover[f'out_{half}'] = tuple(Mark(f'row {row}, left out', int(row)) for row in rows)
         add_bar(figure, scattered, discs, _label(signed=signed), orientation='horizontal',
                 shrink=0.8, pad=0.03)
-    return Drawing(name, f'{title}{more}', figure, hover)
+    yield Drawing(name, f'{title}{more}', figure, hover)
 
 
 def _hemispheres(discs: Sequence[Any]) -> Iterator[tuple[Any, str, bool]]:
@@ -277,7 +268,7 @@ def _equal_area(force: Floats) -> Floats:
 
 
 def against(residuals: Residuals, variables: Sequence[Variable], name: str, title: str,
-            limit: float, colour: str) -> Drawing:
+            limit: float, *, colour: str) -> Drawing:
     """Draw residuals against variables, one panel per variable; `limit` is of the axis [mg]."""
     values, signed, count = residuals.after_mg, residuals.signed, len(variables)
     size = float(np.clip(5.5 - len(values) / 80.0, 2.5, 5.5))
@@ -299,7 +290,7 @@ def against(residuals: Residuals, variables: Sequence[Variable], name: str, titl
 
 def of_coverage(residuals: Residuals, share: float, next_pose: Floats | None) -> Drawing:
     """Draw the poses over the sphere, the directions that they do not cover, and the next pose."""
-    title = f'{percentage(share)} of the sphere is within 45° of a pose'
+    title = f'{100.0 * share:.0f} % of the sphere is within 45° of a pose'
     force, marks, hover = residuals.force, _marks(residuals), dict[str, Marks]()
     open_ = uncovered(force)
     with drawn(HEIGHT_INCHES, title, columns=2, grid='') as (figure, discs):
@@ -329,8 +320,8 @@ def of_before_after(residuals: Residuals, floor_mg: float | None) -> Drawing:
 
 
 def _before_after_title(residuals: Residuals) -> str:
-    before = rms(residuals.before_mg)
-    return f'Each pose before and after: {short(before)} and {short(residuals.rms_mg)} mg RMS'
+    before, after = rms(residuals.before_mg), rms(residuals.after_mg)
+    return f'Each pose before and after: {short(before)} and {short(after)} mg RMS'
 
 
 def _draw_before_after(panel: Any, residuals: Residuals, floor_mg: float | None) -> None:

@@ -183,25 +183,15 @@ class Drawing:
     figure: Figure
     hover: Mapping[str, Marks] = field(default_factory=dict)
 
-    @property
-    def is_live(self) -> bool:
-        """Whether it has markers with a text."""
-        return any(self.hover.values())
-
-
-def has_matplotlib() -> bool:
-    """Return whether figures can be drawn."""
-    return find_spec('matplotlib') is not None
-
 
 def check_matplotlib() -> None:
     """Raise InputError if matplotlib is not installed."""
-    if not has_matplotlib():
+    if find_spec('matplotlib') is None:
         raise InputError('matplotlib is not installed, but figures need it',
                          'run pip install matplotlib')
 
 
-def _styled() -> Any:
+def styled() -> Any:
     """Return the context manager for drawing and saving figures."""
     from matplotlib import rc_context
 
@@ -221,7 +211,7 @@ def drawn(height_inches: float, title: str = '', rows: int = 1, columns: int = 1
     """
     from matplotlib.figure import Figure
 
-    with _styled():
+    with styled():
         figure = Figure(figsize=(width_inches, height_inches), layout='constrained')
         if title:
             figure.suptitle(title, x=0.02, ha='left', fontsize=10.5, parse_math=False)
@@ -254,12 +244,6 @@ def add_band(panel: Any, at: Floats, low: Floats, high: Floats, colour: str, alp
     panel.fill_between(at, low, high, color=colour, alpha=alpha, linewidth=0.0)
 
 
-def save(drawing: Drawing, path: Path) -> None:
-    """Write a figure to a file; the suffix sets the format."""
-    with _styled():
-        drawing.figure.savefig(path, dpi=160, facecolor='white')
-
-
 # ----------------------------------------------------------------------------- figures on a page
 
 def _inline_svg(drawing: Drawing) -> str:
@@ -270,7 +254,7 @@ def _inline_svg(drawing: Drawing) -> str:
 
     """
     buffer = io.StringIO()
-    with _styled():
+    with styled():
         drawing.figure.savefig(buffer, format='svg', transparent=True,
                                metadata={'Date': None, 'Creator': None})
     root = ElementTree.fromstring(buffer.getvalue())

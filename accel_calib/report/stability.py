@@ -15,6 +15,7 @@ the sensitivities.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+import math
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +25,13 @@ from .sheet import (
     ACCENT, add_band, add_bar, AFTER, AXIS_COLOURS, BAND, BEFORE, Drawing, drawn, EDGE, FAINT,
     HEIGHT_INCHES, INK, legend_below, Mark, Marks, page, PAPER, THERMAL, THIRD)
 from ..calibration import Calibration
-from ..comparison import Comparison, History, Parameter
+from ..comparison import Comparison, History
 from ..findings import (
-    change_in_words, CROSS, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, Rating,
-    scale_of)
+    change_words, CROSS, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, Rating, scale_of)
 from ..noise import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
 from ..statistics import rms
 from ..table import Floats
-from ..text import power_of_ten, short, with_minus, with_sd
+from ..text import short, with_minus, with_sd
 from ..units import is_native
 
 _LOOKS = dict(zip('xyz', zip(AXIS_COLOURS, 'os^')))
@@ -50,13 +50,20 @@ def noise_page(found: NoiseFigures, source: str) -> str:
     if found.temperature is not None:
         low, high = found.temperature
         pairs.append(('temperature', f'{low:.1f} to {high:.1f} °C'))
+    tables = []
+    for kind in found.kinds:
+        axes = found.of(kind)
+        rows = [(f'{label} [{unit}]', *cells) for label, unit, cells in figure_rows(axes)]
+        times = (f'{duration(axis.used[0])} to {duration(axis.used[1])}' for axis in axes)
+        tables.append((kind, ['', *(axis.axis for axis in axes), 'typical'],
+                       [*rows, ('from τ', *times, '')]))
     return page('noise', f'Noise of {Path(source).name or source}', [source], rate_noise(found),
-                key_numbers=pairs, drawings=(_allan(found.of(kind)) for kind in found.kinds),
-                tables=[_table(found, kind) for kind in found.kinds], notes=found.notes,
-                needs=need_lines(found), kalibr=kalibr_lines(found))
+                key_numbers=pairs, drawings=(_draw_allan(found.of(kind)) for kind in found.kinds),
+                tables=tables, notes=found.notes, needs=need_lines(found),
+                kalibr=kalibr_lines(found))
 
 
-def _allan(axes: Sequence[AxisNoise]) -> Drawing:
+def _draw_allan(axes: Sequence[AxisNoise]) -> Drawing:
     """Draw the Allan deviation of the axes of one sensor over τ, with their 95 % bands."""
     kind, hover = axes[0].kind, {}
     unit, scale = shown_unit(kind, 'bias_instability', axes[0].unit)
@@ -82,15 +89,6 @@ def _allan(axes: Sequence[AxisNoise]) -> Drawing:
             f'{duration(float(axis.tau[np.argmin(axis.deviation)]))}' for axis in axes]
     return Drawing(f'allan_{kind}', f'Allan deviation of the {kind} over τ: {", ".join(ends)}',
                    figure, hover)
-
-
-def _table(found: NoiseFigures, kind: Kind) -> tuple[Kind, list[str], list[list[str]]]:
-    """Return the kind of a sensor, and the head and the rows of the table of its figures."""
-    axes = found.of(kind)
-    rows = [[f'{label} [{unit}]', *cells] for label, unit, cells in figure_rows(axes)]
-    rows.append(['from τ', *(f'{duration(axis.used[0])} to {duration(axis.used[1])}'
-                             for axis in axes), ''])
-    return kind, ['', *(axis.axis for axis in axes), 'typical'], rows
 
 
 def figure_rows(axes: Sequence[AxisNoise]) -> Iterator[tuple[str, str, list[str]]]:
@@ -122,7 +120,10 @@ def kalibr_lines(found: NoiseFigures) -> list[str]:
     for (kind, figure), unit in _KALIBR.items():
         value, sd = found.common(kind, figure)
         if np.isfinite(value) and not is_native(found.of(kind)[0].unit):
-            lines.append(f'{kind}_{figure}: {power_of_ten(value, sd)} {unit}')
+            power = math.floor(math.log10(value))
+            words = (with_sd(value, sd) if -3 <= power <= 3 else
+                     f'({with_sd(value / 10.0 ** power, sd / 10.0 ** power)})e{power}')
+            lines.append(f'{kind}_{figure}: {words} {unit}')
     return [*lines, f'update_rate: {found.rate:.6g} Hz'] if lines else []
 
 
@@ -135,19 +136,9 @@ GROUPS = (('offset', 'Zero-g offset', OFFSETS), ('gain', 'Gain minus 1', GAINS),
 _COLOURS = (AFTER, ACCENT, THIRD, BEFORE)
 
 
-def spoken(name: str) -> str:
-    """Return the name of a parameter in words, such as ``offset x``."""
-    return name.replace('.', ' ')
-
-
 def named_words(name: str, value: float, sd: float) -> str:
     """Return a parameter with its name, such as ``offset x +20.3 ± 0.1 mg``."""
-    return f'{spoken(name)} {in_words(name, value, sd)}'
-
-
-def change_words(name: str, change: float, sd: float) -> str:
-    """Return the change of a parameter with its name."""
-    return f'{spoken(name)} {change_in_words(name, change, sd)}'
+    return f'{name.replace(".", " ")} {in_words(name, value, sd)}'
 
 
 def of_parameters(comparison: Comparison, labels: Sequence[str]) -> Iterator[Drawing]:
@@ -193,7 +184,19 @@ def of_history(history: History) -> Iterator[Drawing]:
         title, hover = f'{words} over the dates, with 95 % band', dict[str, Marks]()
         with drawn(0.9 + 1.25 * len(found), title, len(found), sharex=True) as (figure, panels):
             for k, (panel, each) in enumerate(zip(panels, found, strict=True)):
-                markers = _draw_line(panel, each, at, warm if varied else None)
+                zero, factor, unit = scale_of(each.name)
+                values, band = (each.values - zero) * factor, BAND * each.stated_sd * factor
+                add_band(panel, at, values - band, values + band, AFTER)
+                panel.plot(at, values, color=FAINT, linewidth=1.2)
+                panel.vlines(at, values - band, values + band, color=BEFORE, linewidth=1.0)
+                panel.set_ylabel(f'{each.name.partition(".")[2]} [{unit}]')
+                if varied:
+                    markers = panel.scatter(
+                        at, values, c=np.where(np.isfinite(warm), warm, np.mean(known)),
+                        cmap=THERMAL, edgecolors=INK, linewidths=0.5, zorder=3,
+                        vmin=np.min(known), vmax=np.max(known))
+                else:
+                    markers, = panel.plot(at, values, 'o', color=AFTER, markeredgecolor=PAPER)
                 markers.set_gid(f'panel{k}')
                 hover[f'panel{k}'] = tuple(Mark(
                     f'{label}, {named_words(each.name, value, sd)}'
@@ -219,20 +222,6 @@ def places_of(stamps: Sequence[float | None]) -> tuple[Floats, bool]:
     return (days if dated else np.arange(1.0, len(days) + 1.0)), dated
 
 
-def _draw_line(panel: Any, each: Parameter, at: Floats, warm: Floats | None) -> Any:
-    zero, factor, unit = scale_of(each.name)
-    values, band = (each.values - zero) * factor, BAND * each.stated_sd * factor
-    add_band(panel, at, values - band, values + band, AFTER)
-    panel.plot(at, values, color=FAINT, linewidth=1.2)
-    panel.vlines(at, values - band, values + band, color=BEFORE, linewidth=1.0)
-    panel.set_ylabel(f'{each.name.partition(".")[2]} [{unit}]')
-    if warm is None:
-        return panel.plot(at, values, 'o', color=AFTER, markeredgecolor=PAPER)[0]
-    colours = np.where(np.isfinite(warm), warm, np.nanmean(warm))
-    return panel.scatter(at, values, c=colours, cmap=THERMAL, edgecolors=INK, linewidths=0.5,
-                         zorder=3, vmin=np.nanmin(warm), vmax=np.nanmax(warm))
-
-
 def label_dates(panel: Any, at: Floats, label: str, *, dated: bool) -> None:
     """Label the axis with dates of `label`, or with numbers of calibrations."""
     if not dated:
@@ -252,20 +241,16 @@ def comparison_page(comparison: Comparison, rating: Rating, sources: Sequence[Pa
                     calibrations: Sequence[Calibration]) -> str:
     """Return the page of a comparison of the calibrations in the files `sources`, as HTML."""
     labels = [f'{k} {source.name}' for k, source in enumerate(sources, 1)]
-    title = f'Comparison of {len(calibrations)} calibrations{_of_sensor(calibrations)}'
+    sensor = next((f' of {each.sensor}' for each in calibrations if each.sensor), '')
     runs = [(label, each.date[:10], each.name, short(run.rms_mg), short(run.expected_mg),
              short(run.largest_mg), f'{run.p_value:.2g}')
             for label, each, run in zip(labels, calibrations, comparison.runs, strict=True)]
-    return page('comparison', title, map(str, sources), rating, history=False, runs=runs, head=(
+    return page('comparison', f'Comparison of {len(calibrations)} calibrations{sensor}',
+                map(str, sources), rating, history=False, runs=runs, head=(
                     'run', 'date', 'model', 'RMS [mg]', 'expected [mg]', 'largest [mg]', 'p'),
                 drawings=of_parameters(comparison, labels),
                 parameters=list(parameter_rows(comparison)),
                 notes=filter(None, (*comparison.notes, comparison.tilt_words)))
-
-
-def _of_sensor(calibrations: Sequence[Calibration]) -> str:
-    name = next((each.sensor for each in calibrations if each.sensor), '')
-    return f' of {name}' if name else ''
 
 
 def parameter_rows(comparison: Comparison) -> Iterator[tuple[str, ...]]:
@@ -273,7 +258,7 @@ def parameter_rows(comparison: Comparison) -> Iterator[tuple[str, ...]]:
     for each in (one for one in comparison.parameters if np.any(one.stated_sd)):
         zero, factor, unit = scale_of(each.name)
         mean = with_minus(short((each.values.mean() - zero) * factor))
-        yield (spoken(each.name), f'{mean} {unit}', short(each.spread * factor),
+        yield (each.name.replace('.', ' '), f'{mean} {unit}', short(each.spread * factor),
                short(rms(each.stated_sd) * factor),
                '' if each.ratio is None else f'{each.ratio:.2f}')
 
@@ -294,9 +279,10 @@ def history_page(history: History, sources: Sequence[Path],
                         short(moment.residual_mg), *(
                             in_words(each.name, each.values[k], each.stated_sd[k])
                             for each in history.parameters)))
-    return page('comparison',
-                f'History of {len(calibrations)} calibrations{_of_sensor(calibrations)}',
+    sensor = next((f' of {each.sensor}' for each in calibrations if each.sensor), '')
+    names = [each.name.replace('.', ' ') for each in history.parameters]
+    return page('comparison', f'History of {len(calibrations)} calibrations{sensor}',
                 [f'{history.labels[0]} to {history.labels[-1]}'], rate_comparison(history.whole),
                 history=True, drawings=of_history(history), changes=changes, runs=moments, head=(
-                    '', 'date', 'file', 'model', '°C', 'residual [mg]',
-                    *(spoken(each.name) for each in history.parameters)), notes=history.notes)
+                    '', 'date', 'file', 'model', '°C', 'residual [mg]', *names),
+                notes=history.notes)

@@ -17,7 +17,7 @@ EventsExecutor.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial, partialmethod
 from queue import SimpleQueue
 from time import monotonic
@@ -38,19 +38,19 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from .declare import (
-    CALLS, declared, follow, LATCHED, mismatches, MountingBroadcaster, name_of,
-    published_by_others, SENSOR, STREAM, watch_static)
+    CALLS, declared, follow, LATCHED, mismatches, name_of, needs_tf2, published_by_others, SENSOR,
+    static_transform, STREAM, TOPIC, watch_static)
 from .stream import ContextTopics, Stream
 from ..calibration import NextPose
 from ..errors import AccelCalibError
 from ..finding import LEVELS
 from ..findings import request_words
 from ..live import check_installed
+from ..logs import named_topics
 from ..messages.correction import output_frame
 from ..session import (
-    CalibratorSettings, CallSoon, Check, checks, COMMANDS, conditions, context_topics, diagnostics,
-    enable, Event, figures, Log, Mounting, progress, Result, run, Session, ShowPoses, Still,
-    Surroundings, Task, Worker)
+    CalibratorSettings, CallSoon, Check, COMMANDS, conditions, diagnostics, enable, Event, figures,
+    Log, Mounting, progress, Result, run, Session, ShowPoses, Still, Surroundings, Task, Worker)
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -68,7 +68,6 @@ _ASKED_FOR = (1.0, 0.6, 0.0, 1.0)
 _WORDS = (1.0, 1.0, 1.0, 1.0)
 _SPHERE = (0.6, 0.6, 0.7, 0.15)
 _NUMBER_AT, _WORDS_AT = 1.12, 1.35
-_TEXT = Marker.TEXT_VIEW_FACING
 _CENTRE = np.zeros(3)
 _ABOVE = np.array([0.0, 0.0, _WORDS_AT])
 _DOT, _LETTER, _SHAFT = 0.1, 0.1, 0.04
@@ -81,36 +80,34 @@ def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerAr
     The (n, 3) directions of up are unit vectors in the sensor axes.
 
     """
-    markers = [Marker(action=Marker.DELETEALL), _marker('sphere', 0, Marker.SPHERE, _SPHERE, 2.0)]
+    markers = [Marker(action=Marker.DELETEALL), _marker('sphere', 0, _SPHERE, 2.0)]
     for k, direction in enumerate(directions):
-        markers += [_marker('poses', k, Marker.SPHERE, _CAPTURED, _DOT, direction),
-                    _marker('numbers', k, _TEXT, _WORDS, _LETTER, direction * _NUMBER_AT,
+        markers += [_marker('poses', k, _CAPTURED, _DOT, direction),
+                    _marker('numbers', k, _WORDS, _LETTER, direction * _NUMBER_AT,
                             text=str(k + 1))]
     words_at = _ABOVE
     if asked.direction is not None:
         words_at = asked.direction * _WORDS_AT
-        markers.append(_marker('next', 0, Marker.ARROW, _ASKED_FOR, _SHAFT))
-        markers[-1].points = [Point(), _point(asked.direction)]
-        markers[-1].scale.y = markers[-1].scale.z = 2.0 * _SHAFT
-    markers.append(_marker('next', 1, _TEXT, _WORDS, _LETTER, words_at, text=request_words(asked)))
+        arrow = _marker('next', 0, _ASKED_FOR, _SHAFT)
+        arrow.type, arrow.scale.y, arrow.scale.z = Marker.ARROW, 2.0 * _SHAFT, 2.0 * _SHAFT
+        arrow.points = [Point(), Point(**dict(zip('xyz', asked.direction.tolist())))]
+        markers.append(arrow)
+    markers.append(_marker('next', 1, _WORDS, _LETTER, words_at, text=request_words(asked)))
     for marker in markers:
         marker.header.frame_id = frame_id
     return MarkerArray(markers=markers)
 
 
-def _marker(namespace: str, number: int, kind: int, color: tuple[float, ...], size: float,
-            at: Floats = _CENTRE, text: str = '') -> Marker:
-    red, green, blue, alpha = color
-    marker = Marker(ns=namespace, id=number, type=kind, action=Marker.ADD, text=text,
-                    color=ColorRGBA(r=red, g=green, b=blue, a=alpha))
+def _marker(namespace: str, number: int, color: tuple[float, ...], size: float,
+            at: Floats = _CENTRE, *, text: str = '') -> Marker:
+    """Return a sphere, or a text if it is not empty."""
+    marker = Marker(ns=namespace, id=number, action=Marker.ADD, text=text,
+                    type=Marker.TEXT_VIEW_FACING if text else Marker.SPHERE,
+                    color=ColorRGBA(**dict(zip('rgba', color))))
     marker.scale.x = marker.scale.y = marker.scale.z = size
-    marker.pose.position, marker.pose.orientation.w = _point(at), 1.0
+    marker.pose.position = Point(**dict(zip('xyz', at.tolist())))
+    marker.pose.orientation.w = 1.0
     return marker
-
-
-def _point(position: Floats) -> Point:
-    x, y, z = position.tolist()
-    return Point(x=x, y=y, z=z)
 
 
 class Calibrator:
@@ -126,7 +123,8 @@ class Calibrator:
         self._name = node.get_fully_qualified_name().lstrip('/')
         self._topic = node.resolve_topic_name('imu/data_raw')
         settings = declared(node, CalibratorSettings)
-        self._broadcaster = MountingBroadcaster(node) if settings.publish_tf else None
+        self._mounting = (node.create_publisher(needs_tf2('publish_tf'), TOPIC, LATCHED)
+                          if settings.publish_tf else None)
         self._transforms = (watch_static(node, self._on_transforms) if settings.base_frame
                             else None)
         self._context = ContextTopics(node, settings)
@@ -158,46 +156,40 @@ class Calibrator:
     def start(self) -> None:
         """Start; to be called when the node has an executor."""
         self._worker.handle_events()
-        node, overrides = self._node, self._overrides
+        node, overrides, settings = self._node, self._overrides, self.session.state.settings
         node.create_subscription(Imu, 'imu/data_raw', self.stream.on_message, SENSOR, raw=True,
                                  qos_overriding_options=overrides)
-        if 'temperature' not in context_topics(self.session.state.settings):
+        if 'temperature' not in named_topics(settings.context):
             around = self.session.state.around
             node.create_subscription(
                 Temperature, 'temperature',
                 lambda message: around.take('temperature', message.temperature),
                 SENSOR, qos_overriding_options=overrides)
         node.create_timer(1.0, self._on_tick, clock=self._steady)
-        if self.session.state.settings.web_port:
-            try:
-                self._serve_page()
-            except AccelCalibError as error:
-                self._worker.log('error', str(error))
-
-    def _serve_page(self) -> None:
-        """Serve the live page; its server has its own thread."""
-        check_installed()
-        from ..live.exchange import Exchange
-        from ..live.server import PageServer
-        from ..live.viewer import PERIOD
-        page, settings = Exchange(self.session, self._worker, self._call_soon), (
-            self.session.state.settings)
-        server = PageServer(page, settings.web_host, settings.web_port)
-        server.start()
-        self._page, self._server = page, server
-        self._worker.log('info', server.announce())
-        self._node.create_timer(PERIOD, lambda: page.show_progress(self.stream.newest),
-                                clock=self._steady)
+        if not settings.web_port:
+            return
+        try:  # to serve the live page, in its own thread
+            check_installed()
+            from ..live.exchange import Exchange
+            from ..live.server import PageServer
+            from ..live.viewer import PERIOD
+            page = Exchange(self.session, self._worker, self._call_soon)
+            server = PageServer(page, settings.web_host, settings.web_port)
+            server.start()
+            self._page, self._server = page, server
+            self._worker.log('info', server.announce())
+            node.create_timer(PERIOD, lambda: page.show_progress(self.stream.newest),
+                              clock=self._steady)
+        except AccelCalibError as error:
+            self._worker.log('error', str(error))
 
     def _on_transforms(self) -> None:
         """Take the mounting from the static transforms, as soon as they connect the frames."""
-        session = self.session
-        frame_id, base = session.state.frame_id, session.state.settings.base_frame
-        if self._transforms is None or not frame_id:
-            return
-        rotation = self._transforms.rotation(base, frame_id)
-        if rotation is not None:
-            session.set_mounting(rotation.T)
+        state = self.session.state
+        if self._transforms is not None and state.frame_id:
+            rotation = self._transforms.rotation(state.settings.base_frame, state.frame_id)
+            if rotation is not None:
+                self.session.set_mounting(rotation.T)
 
     def _on_tick(self) -> None:
         node = self._node
@@ -212,18 +204,19 @@ class Calibrator:
         self._on_samples()
         if self._diagnostics.get_subscription_count():
             state = self.session.state
-            first, *others = map(self._status, diagnostics(state))
-            first.values = [KeyValue(key=key, value=value) for key, value in figures(state)]
-            array = DiagnosticArray(status=[first, *others])
-            array.header.stamp = self._node.get_clock().now().to_msg()
+            first, *others = diagnostics(state)
+            array = DiagnosticArray(status=[
+                self._status(first, figures(state)), *map(self._status, others)])
+            array.header.stamp = node.get_clock().now().to_msg()
             self._diagnostics.publish(array)
         if self._page is not None:
             self._page.show_state()
 
-    def _status(self, check: Check) -> DiagnosticStatus:
+    def _status(self, check: Check, shown: Iterable[tuple[str, str]] = ()) -> DiagnosticStatus:
         return DiagnosticStatus(
             level=bytes([LEVELS.index(check.level)]), name=f'{self._name}: {check.concern}',
-            message=check.words, hardware_id=self.session.state.name)
+            message=check.words, hardware_id=self.session.state.name,
+            values=[KeyValue(key=key, value=value) for key, value in shown])
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> Any:
         response.success, response.message = True, enable(self.session, request.data)
@@ -231,7 +224,7 @@ class Calibrator:
 
     def _on_self_test(self, request: SelfTest.Request, response: SelfTest.Response) -> Any:
         self.stream.flush()
-        found = checks(self.session.state)
+        found = diagnostics(self.session.state)[1:]
         response.id, response.status = self.session.state.name, list(map(self._status, found))
         response.passed = bytes([all(each.level == LEVELS[0] for each in found)])
         return response
@@ -246,10 +239,8 @@ class Calibrator:
     def _show_progress(self) -> None:
         self._progress_at, now = monotonic(), self.session.state
         first = conditions(now)[0]
-        status = self._status(Check('progress', first.text, first.level))
-        status.values = [KeyValue(key=key, value=value)
-                         for key, value in progress(now).figures()]
-        self._progress.publish(status)
+        self._progress.publish(self._status(
+            Check('progress', first.text, first.level), progress(now).figures()))
 
     def _show(self, event: Event) -> None:
         if self._page is not None:
@@ -270,11 +261,11 @@ class Calibrator:
             case Result(text):
                 self._result.publish(String(data=text))
             case Mounting(rotation, frame_id) if (
-                    self._broadcaster is not None and calibration is not None and frame_id):
+                    self._mounting is not None and calibration is not None and frame_id):
                 settings = self.session.state.settings
-                self._broadcaster.publish(
+                self._mounting.publish(static_transform(
                     self._node.get_clock().now().to_msg(), frame_id, output_frame(
-                        calibration, frame_id, settings.output_frame_id), rotation)
+                        calibration, frame_id, settings.output_frame_id), rotation))
 
     def close(self) -> None:
         """Finish writing, and release the files."""
@@ -352,7 +343,7 @@ class ManagedCalibrator(LifecycleNode):
             self._calibrator = Calibrator(self)
         except AccelCalibError as error:
             self.get_logger().error(str(error))
-            self._destroy_entities()
+            self.on_cleanup(state)
             return TransitionCallbackReturn.FAILURE
         self._calibrator.stream.set_active(active=False)
         self._calibrator.start()
@@ -361,7 +352,15 @@ class ManagedCalibrator(LifecycleNode):
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close the files and remove all topics and services."""
         self.close()
-        self._destroy_entities()
+        for kinds, destroy in ((self.publishers, self.destroy_publisher),
+                               (self.subscriptions, self.destroy_subscription),
+                               (self.services, self.destroy_service),
+                               (self.timers, self.destroy_timer)):
+            for each in list(kinds):
+                if each not in self._own:
+                    # The executor calls these for the events that it has already received.
+                    each.callback = each.send_response = lambda *given: None
+                    destroy(each)
         return TransitionCallbackReturn.SUCCESS
 
     on_shutdown = on_cleanup
@@ -380,15 +379,3 @@ class ManagedCalibrator(LifecycleNode):
         if self._calibrator is not None:
             self._calibrator.close()
             self._calibrator = None
-
-    def _destroy_entities(self) -> None:
-        """Remove what the calibrator has created in this node."""
-        for kinds, destroy in ((self.publishers, self.destroy_publisher),
-                               (self.subscriptions, self.destroy_subscription),
-                               (self.services, self.destroy_service),
-                               (self.timers, self.destroy_timer)):
-            for each in list(kinds):
-                if each not in self._own:
-                    # The executor calls these for the events that it has already received.
-                    each.callback = each.send_response = lambda *given: None
-                    destroy(each)

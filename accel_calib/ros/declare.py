@@ -8,15 +8,15 @@ At 1 kHz, a busy machine loses a few messages in 10,000 with depth 10, and none 
 
 Transforms of a URDF that do not move arrive on /tf_static in several latched messages, often from
 several nodes. Only their rotations are needed. The message type is in tf2_msgs, which is imported
-only if a parameter needs it: the node also runs without this package.
+only if a parameter needs it: the node also runs without this package. As in tf2, names of frames
+have no leading slash.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import Field, fields
-from difflib import get_close_matches
+from dataclasses import dataclass, field, fields
 import math
 from typing import Any, TYPE_CHECKING
 
@@ -47,22 +47,24 @@ def declared(node: Node, kind: type[Settings], *, fixed: bool = True) -> Setting
     """
     try:
         for each in fields(kind):
+            default, limits = default_of(each), each.metadata['limits']
+            descriptor = ParameterDescriptor(  # for `ros2 param describe` and rqt
+                name=each.name, description=each.metadata['words'],
+                type=Parameter.Type.from_parameter_value(default).value,
+                additional_constraints=expected(each),
+                read_only=fixed and not each.metadata['live'], dynamic_typing=True)
+            if limits is not None and isinstance(default, float):
+                descriptor.floating_point_range = [FloatingPointRange(
+                    from_value=limits[0], to_value=limits[1])]
+            elif limits is not None:
+                descriptor.integer_range = [IntegerRange(
+                    from_value=int(limits[0]), to_value=int(limits[1]))]
             if not node.has_parameter(each.name):  # a managed node may be configured again
-                node.declare_parameter(each.name, default_of(each), _descriptor(each, fixed))
+                node.declare_parameter(each.name, default, descriptor)
     except InvalidParameterValueException as error:
         raise InputError(str(error), 'correct the value') from error
     return changed(kind(), {each.name: node.get_parameter(each.name).value
                             for each in fields(kind)})
-
-
-def misspelt(node: Node) -> list[str]:
-    """Return one line for each parameter that was given to a node and that it does not have."""
-    names = [name for name in node._parameter_overrides if not node.has_parameter(name)
-             and not name.startswith('qos_overrides.')]
-    known = list(node.get_parameters_by_prefix(''))
-    near = {name: ' or '.join(get_close_matches(name, known)) for name in names}
-    return [f'there is no parameter {name}, expected {words or "one of ros2 param list"}: correct '
-            'the name' for name, words in near.items()]
 
 
 def follow(node: Node, settings: Callable[[], Settings],
@@ -89,23 +91,6 @@ def follow(node: Node, settings: Callable[[], Settings],
 
     node.add_on_set_parameters_callback(on_set)
     return on_set
-
-
-def _descriptor(parameter: Field[Any], fixed: bool) -> ParameterDescriptor:
-    """Return the description of a parameter, for `ros2 param describe` and rqt."""
-    default, limits = default_of(parameter), parameter.metadata['limits']
-    descriptor = ParameterDescriptor(
-        name=parameter.name, description=parameter.metadata['words'],
-        type=Parameter.Type.from_parameter_value(default).value,
-        additional_constraints=expected(parameter),
-        read_only=fixed and not parameter.metadata['live'], dynamic_typing=True)
-    if limits is not None and isinstance(default, float):
-        least, most = limits
-        descriptor.floating_point_range = [FloatingPointRange(from_value=least, to_value=most)]
-    elif limits is not None:
-        least, most = map(int, limits)
-        descriptor.integer_range = [IntegerRange(from_value=least, to_value=most)]
-    return descriptor
 
 
 SENSOR = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -150,33 +135,29 @@ def mismatches(node: Node) -> tuple[str, ...]:
     rclpy reports a difference.
 
     """
-    lines = []
-    for own in node.subscriptions:
-        for other in node.get_publishers_info_by_topic(own.topic_name):
-            why = _mismatch(other.qos_profile, own.qos_profile)
-            if why:
-                lines.append(f'{name_of(other)} publishes on {own.topic_name} with the QoS {why}, '
-                             'so that nothing arrives here: start this node without '
-                             f'qos_overrides.{own.topic_name}.subscription')
-    for own in node.publishers:
-        for other in node.get_subscriptions_info_by_topic(own.topic_name):
-            why = _mismatch(own.qos_profile, other.qos_profile)
-            if why:
-                lines.append(f'{own.topic_name} has the QoS {why}, so that {name_of(other)} '
-                             'receives nothing: change the QoS of that subscriber')
-    return tuple(dict.fromkeys(lines))
-
-
-def _mismatch(offered: QoSProfile, wanted: QoSProfile) -> str:
-    """Return why a subscription does not receive what a publisher offers; empty if it does."""
-    words = []
-    if (offered.reliability == ReliabilityPolicy.BEST_EFFORT
-            and wanted.reliability == ReliabilityPolicy.RELIABLE):
-        words.append('best effort, but the subscriber expects reliable')
-    if (offered.durability == DurabilityPolicy.VOLATILE
-            and wanted.durability == DurabilityPolicy.TRANSIENT_LOCAL):
-        words.append('volatile, but the subscriber expects transient local')
-    return ' and '.join(words)
+    pairs = [(own, other, True) for own in node.subscriptions
+             for other in node.get_publishers_info_by_topic(own.topic_name)]
+    pairs += [(own, other, False) for own in node.publishers
+              for other in node.get_subscriptions_info_by_topic(own.topic_name)]
+    lines = {}
+    for own, other, receives in pairs:
+        offered, wanted = own.qos_profile, other.qos_profile
+        if receives:
+            offered, wanted = wanted, offered
+        words = []
+        if (offered.reliability == ReliabilityPolicy.BEST_EFFORT
+                and wanted.reliability == ReliabilityPolicy.RELIABLE):
+            words.append('best effort, but the subscriber expects reliable')
+        if (offered.durability == DurabilityPolicy.VOLATILE
+                and wanted.durability == DurabilityPolicy.TRANSIENT_LOCAL):
+            words.append('volatile, but the subscriber expects transient local')
+        topic, why, name = own.topic_name, ' and '.join(words), name_of(other)
+        if why:
+            lines[f'{name} publishes on {topic} with the QoS {why}, so that nothing arrives here: '
+                  f'start this node without qos_overrides.{topic}.subscription' if receives else
+                  f'{topic} has the QoS {why}, so that {name} receives nothing: change the QoS of '
+                  'that subscriber'] = None
+    return tuple(lines)
 
 
 # ----------------------------------------------------------------------------- static transforms
@@ -204,11 +185,11 @@ def needs_tf2(parameter: str) -> Any:
     return TFMessage
 
 
+@dataclass(frozen=True)
 class StaticTransforms:
-    """A tree of frames, and the rotations between them."""
+    """A tree of frames: the parent of each frame, and the rotation of vectors to the parent."""
 
-    def __init__(self) -> None:
-        self._parents: dict[str, tuple[str, Floats]] = {}
+    parents: dict[str, tuple[str, Floats]] = field(default_factory=dict)
 
     def add(self, parent: str, child: str, quaternion: Sequence[float]) -> bool:
         """
@@ -219,7 +200,7 @@ class StaticTransforms:
         the tree is then unchanged.
 
         """
-        parent, child = _plain(parent), _plain(child)
+        parent, child = parent.removeprefix('/'), child.removeprefix('/')
         if not (parent and child):
             raise InputError(f'a static transform from {parent!r} to {child!r} has an empty frame '
                              'name, expected two names', 'correct the node that publishes it')
@@ -236,14 +217,15 @@ class StaticTransforms:
                 f'{z:g}, {w:g}) of length {math.sqrt(squared):.3g}, expected length 1',
                 'correct the node that publishes it')
         rotation = rotation_from_quaternion(quaternion)
-        before = self._parents.get(child)
-        self._parents[child] = (parent, rotation)
+        before = self.parents.get(child)
+        self.parents[child] = (parent, rotation)
         return before is None or before[0] != parent or not np.array_equal(before[1], rotation)
 
     def rotation(self, base: str, frame: str) -> Floats | None:
         """Return the (3, 3) rotation of vectors from `frame` to `base`; None: not connected."""
-        above_base = self._rotations_above(_plain(base))
-        for common, mat_common_frame in self._rotations_above(_plain(frame)).items():
+        above_base, above = (
+            self._rotations_above(each.removeprefix('/')) for each in (base, frame))
+        for common, mat_common_frame in above.items():
             if common in above_base:
                 return above_base[common].T @ mat_common_frame
         return None
@@ -251,8 +233,8 @@ class StaticTransforms:
     def _rotations_above(self, frame: str) -> dict[str, Floats]:
         """Return the rotation from a frame to itself and to each frame above it, nearest first."""
         found: dict[str, Floats] = {frame: np.eye(3)}
-        while frame in self._parents:
-            parent, mat_parent_frame = self._parents[frame]
+        while frame in self.parents:
+            parent, mat_parent_frame = self.parents[frame]
             found[parent] = mat_parent_frame @ found[frame]
             frame = parent
         return found
@@ -284,22 +266,9 @@ def watch_static(node: Node, on_change: Callable[[], None]) -> StaticTransforms:
     return transforms
 
 
-class MountingBroadcaster:
-    """Publisher of one static transform, without translation; it needs tf2_msgs."""
-
-    def __init__(self, node: Node) -> None:
-        self._message = needs_tf2('publish_tf')
-        self._publisher = node.create_publisher(self._message, TOPIC, LATCHED)
-
-    def publish(self, stamp: Any, parent: str, child: str, rotation: Floats) -> None:
-        """Publish the (3, 3) rotation of vectors from `child` to `parent`."""
-        stamped = TransformStamped(child_frame_id=_plain(child))
-        stamped.header.stamp, stamped.header.frame_id = stamp, _plain(parent)
-        x, y, z, w = quaternion_of(rotation)
-        stamped.transform.rotation = Quaternion(x=x, y=y, z=z, w=w)
-        self._publisher.publish(self._message(transforms=[stamped]))
-
-
-def _plain(frame: str) -> str:
-    """Return the name of a frame as tf2 has it, without a leading slash."""
-    return frame.removeprefix('/')
+def static_transform(stamp: Any, parent: str, child: str, rotation: Floats) -> Any:
+    """Return a message with the (3, 3) rotation of vectors from `child` to `parent`."""
+    stamped = TransformStamped(child_frame_id=child.removeprefix('/'))
+    stamped.header.stamp, stamped.header.frame_id = stamp, parent.removeprefix('/')
+    stamped.transform.rotation = Quaternion(**dict(zip('xyzw', quaternion_of(rotation))))
+    return needs_tf2('publish_tf')(transforms=[stamped])

@@ -16,8 +16,8 @@ succeeds on a slow machine.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import takewhile
 import json
@@ -80,17 +80,15 @@ _NODE = {'sensor': 'demo', 'still_window': 0.25, 'min_dwell': 0.6}
 _SERVICES = ('calibrator/fit', 'calibrator/refine', 'calibrator/set_level', 'simulator/flat',
              'simulator/next')
 
-_KINDS = ('raw', 'corrected', 'truth')
-"""Kinds of messages that are compared: before and after the correction, and the truth."""
+_KINDS = {'raw': ('imu/data_raw', Imu), 'corrected': ('imu/data_calibrated', Imu),
+          'truth': ('simulator/truth', Vector3Stamped)}
+"""Topics and types that are compared: before and after the correction, and the truth."""
 
 _PATIENCE = 120.0
 """Longest time that a step may take, on the slowest machine [s]."""
 
 _LOOK_EVERY = 0.05
 """Interval at which conditions are checked [s]."""
-
-Rest = dict[str, Floats]
-"""Means of raw, corrected and true acceleration over a rest [g], (3,) arrays."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +137,7 @@ class User(Node):
 
     def __init__(self, processes: Sequence[subprocess.Popen[bytes]],
                  report: Callable[[str], None]) -> None:
+        rclpy.init(args=[])
         super().__init__('demo')
         self._processes, self._report = processes, report
         self._executor = SingleThreadedExecutor()
@@ -151,10 +150,8 @@ class User(Node):
         self.create_subscription(
             Temperature, 'temperature',
             lambda message: setattr(self, '_temperature', message.temperature), SENSOR)
-        for name, topic, kind in (('raw', 'imu/data_raw', Imu),
-                                  ('corrected', 'imu/data_calibrated', Imu),
-                                  ('truth', 'simulator/truth', Vector3Stamped)):
-            self.create_subscription(kind, topic, self._keeper(name), SENSOR)
+        for name, (topic, kind) in _KINDS.items():
+            self.create_subscription(kind, topic, partial(self._keep, name), SENSOR)
         # Made once: DDS drops an answer to a client that the node has not discovered yet.
         self._triggers = {name: self.create_client(Trigger, name) for name in _SERVICES}
 
@@ -162,15 +159,10 @@ class User(Node):
         at = [marker.pose.position for marker in markers.markers if marker.ns == 'poses']
         self._poses = np.array([[point.x, point.y, point.z] for point in at]).reshape(-1, 3)
 
-    def _keeper(self, name: str) -> Callable[[Any], None]:
-        kept = self._messages[name]
-
-        def keep(message: Any) -> None:
-            stamp = message.header.stamp
-            vector = message.vector if name == 'truth' else message.linear_acceleration
-            kept[stamp.sec * 10 ** 9 + stamp.nanosec] = vector.x, vector.y, vector.z
-
-        return keep
+    def _keep(self, name: str, message: Any) -> None:
+        stamp = message.header.stamp
+        vector = message.vector if name == 'truth' else message.linear_acceleration
+        self._messages[name][stamp.sec * 10 ** 9 + stamp.nanosec] = vector.x, vector.y, vector.z
 
     @property
     def _up(self) -> tuple[float, ...]:
@@ -192,9 +184,6 @@ class User(Node):
         up = self._rest('raw').sum(axis=(0, 1))
         return bool(np.any(self._poses @ up > _SAME_POSE * np.linalg.norm(up)))
 
-    def _has_rested(self, count: int, *names: str) -> bool:
-        return len(self._rest(*names)) >= count
-
     def turn(self, service: str = 'next') -> None:
         """Turn the sensor, and wait until it rests."""
         self._spin(lambda: bool(self._up), 'a message of the simulator')
@@ -202,8 +191,8 @@ class User(Node):
         self.call(f'simulator/{service}')
         for kept in self._messages.values():
             kept.clear()
-        self._spin(lambda: self._up not in ((), before)
-                   and self._has_rested(_SETTLED, 'truth'), 'rest of the simulated sensor')
+        self._spin(lambda: self._up not in ((), before) and len(self._rest('truth')) >= _SETTLED,
+                   'rest of the simulated sensor')
 
     def capture(self, count: int) -> None:
         """Let the calibrator capture this number of poses."""
@@ -214,31 +203,28 @@ class User(Node):
             if done % 4 == 0:
                 self._report(f'captured {done} poses')
 
-    def measure(self, count: int) -> list[Rest]:
-        """Return the means over the rests in this number of further poses."""
+    def measure(self, count: int) -> Floats:
+        """Return the means over the rests in this number of further poses, (kinds, count, 3)."""
         rests = []
         for done in range(1, count + 1):
             self.turn()
-            self._spin(lambda: self._has_rested(_SAMPLES, *_KINDS) and self._has_captured(),
+            self._spin(lambda: len(self._rest(*_KINDS)) >= _SAMPLES and self._has_captured(),
                        f'rest {done}')
-            rests.append(dict(zip(_KINDS, self._rest(*_KINDS).mean(axis=0))))
-            error = np.linalg.norm(rests[-1]['corrected'] - rests[-1]['truth']) * MG
+            rests.append(self._rest(*_KINDS).mean(axis=0))
+            _, corrected, truth = rests[-1]
+            error = np.linalg.norm(corrected - truth) * MG
             self._report(f'  rest {done:2d} of {count}, now {self._temperature:.1f} °C: '
                          f'imu/data_calibrated is {error:5.2f} mg from the truth')
-        return rests
+        return np.stack(rests, axis=1)
 
     def level(self) -> str:
         """Put the robot flat, and call ``~/set_level`` as soon as the rest is long enough."""
         self.turn('flat')
-        count = _SETTLED
-        while True:
-            self._spin(partial(self._has_rested, count, 'raw'), 'a longer rest')
-            try:
+        for count in range(_SETTLED, _LONGEST_REST, _SETTLED):
+            self._spin(lambda wanted=count: len(self._rest('raw')) >= wanted, 'a longer rest')
+            with suppress(AccelCalibError):
                 return self.call('calibrator/set_level')
-            except AccelCalibError:
-                count += _SETTLED
-                if count >= _LONGEST_REST:
-                    raise
+        return self.call('calibrator/set_level')
 
     def call(self, service: str) -> str:
         """Call a service, and return its answer; AccelCalibError if it fails."""
@@ -269,6 +255,7 @@ class User(Node):
         """Leave DDS."""
         self._executor.shutdown()
         self.destroy_node()
+        rclpy.try_shutdown()
 
 
 def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
@@ -286,30 +273,31 @@ def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
     simulated = {**_HELD, 'effects': [*_EFFECTS, *([hidden] if hidden else [])]}
     with (_isolated() as folder, running('node', _NODE) as node,
           running('simulator', simulated) as simulator,
-          user_of([node, simulator], report) as demo):
+          closing(User([node, simulator], report)) as demo):
         demo.capture(_POSES_HIDDEN if hidden else _POSES)
         report(f'~/fit: {demo.call("calibrator/fit")}')
         report(f'~/set_level: {demo.level()}')
-        rests = demo.measure(_CHECKED_HIDDEN if hidden else _CHECKED)
-        raw, calibrated = (_errors(rests, name) for name in ('raw', 'corrected'))
+        raw, corrected, truth = demo.measure(_CHECKED_HIDDEN if hidden else _CHECKED)
+        outcome = Outcome(len(truth), before=_errors(raw, truth), after=_errors(corrected, truth),
+                          seconds=time.monotonic() - began)
         if not hidden:
-            return Outcome(len(rests), raw, calibrated, time.monotonic() - began)
+            return outcome
         stored = folder / 'accel_calib' / 'demo.yaml'
         fitted = read_calibration(stored).model
         report(f'~/refine: {demo.call("calibrator/refine")}')
         report(f'~/set_level: {demo.level()}')
         refined = read_calibration(stored).model
         lag = refined.lags.get('temperature_of_offset')
-        again = _errors(demo.measure(_CHECKED_HIDDEN), 'corrected')
-        return Outcome(
-            len(rests), calibrated, again, time.monotonic() - began, parse_effect(hidden)[0],
-            tuple(str(name) for name in refined.effects if name not in fitted.effects),
-            0.0 if lag is None else lag.seconds)
+        _, corrected, truth = demo.measure(_CHECKED_HIDDEN)
+        return replace(
+            outcome, before=outcome.after, after=_errors(corrected, truth),
+            seconds=time.monotonic() - began, hidden=parse_effect(hidden)[0],
+            found=tuple(str(name) for name in refined.effects if name not in fitted.effects),
+            lag_s=0.0 if lag is None else lag.seconds)
 
 
-def _errors(rests: Sequence[Rest], name: str) -> Errors:
-    truth = np.array([rest['truth'] for rest in rests])
-    values = np.array([rest[name] for rest in rests])
+def _errors(values: Floats, truth: Floats) -> Errors:
+    """Return the errors of mean accelerations [g], (n, 3)."""
     sizes = np.linalg.norm(values, axis=1)
     errors = (sizes - 1.0) * MG
     cosines = np.sum(values * truth, axis=1) / sizes / np.linalg.norm(truth, axis=1)
@@ -359,19 +347,6 @@ def running(command: str, parameters: dict[str, Any], severity: str = 'error'
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-
-
-@contextmanager
-def user_of(processes: Sequence[subprocess.Popen[bytes]], report: Callable[[str], None]
-            ) -> Iterator[User]:
-    """Yield the user of the nodes."""
-    rclpy.init(args=[])
-    user = User(processes, report)
-    try:
-        yield user
-    finally:
-        user.close()
-        rclpy.try_shutdown()
 
 
 def _check_running(processes: Sequence[subprocess.Popen[bytes]]) -> None:

@@ -24,6 +24,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
+from functools import partial
 import gc
 from importlib import import_module
 import os
@@ -49,25 +51,6 @@ _SWITCH = 1e-4
 """Switch interval of the interpreter [s]; the longest wait of a message for another thread."""
 
 
-def calibrator(args: Sequence[str] | None = None) -> int:
-    """Run the calibrator until it is ended; parameters and exit status as `run`."""
-    return run('.calibrator_node:CalibratorNode', args)
-
-
-def calibrator_lifecycle(args: Sequence[str] | None = None) -> int:
-    """Run the managed calibrator until it is ended; parameters and exit status as `run`."""
-    return run('.calibrator_node:ManagedCalibrator', args)
-
-
-def simulator(args: Sequence[str] | None = None) -> int:
-    """Run the simulator until it is ended; parameters and exit status as `run`."""
-    return run('.simulator_node:SimulatorNode', args)
-
-
-EXECUTABLES = {each.__name__: each for each in (calibrator, calibrator_lifecycle, simulator)}
-"""The executables by name: ``python -m accel_calib.ros.run calibrator``."""
-
-
 def run(node: str, args: Sequence[str] | None = None) -> int:
     """
     Run a node until it is ended; return 0, or 2 if the input is invalid or ROS is not available.
@@ -84,8 +67,10 @@ def run(node: str, args: Sequence[str] | None = None) -> int:
     signal.set_wakeup_fd(written, warn_on_full_buffer=False)
     for number in _SIGNALS:
         signal.signal(number, lambda number, frame: None)  # Python writes to the pipe
+    module, name = node.split(':')
     try:
-        _start(node, args, came)
+        with started(args, 'check the parameters and arguments'):
+            _spin(getattr(import_module(module, __package__), name)(), came)
     except AccelCalibError as error:
         print(f'accel-calib: {error}', file=sys.stderr)
         return _BAD_INPUT
@@ -97,8 +82,18 @@ def run(node: str, args: Sequence[str] | None = None) -> int:
     return _OK
 
 
-def _start(node: str, args: Sequence[str] | None, came: int) -> None:
-    """Start ROS, run the node, and shut down ROS."""
+calibrator = partial(run, '.calibrator_node:CalibratorNode')
+calibrator_lifecycle = partial(run, '.calibrator_node:ManagedCalibrator')
+simulator = partial(run, '.simulator_node:SimulatorNode')
+
+EXECUTABLES = {'calibrator': calibrator, 'calibrator_lifecycle': calibrator_lifecycle,
+               'simulator': simulator}
+"""The executables by name: ``python -m accel_calib.ros.run calibrator``."""
+
+
+@contextmanager
+def started(args: Sequence[str] | None, advice: str) -> Iterator[None]:
+    """Start ROS, and shut it down at the end; the process keeps its signal handlers."""
     try:
         import rclpy
     except ImportError as error:
@@ -108,11 +103,9 @@ def _start(node: str, args: Sequence[str] | None, came: int) -> None:
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
-        raise InputError(f'ROS 2 does not start: {str(error).splitlines()[0]}',
-                         'check the parameters and arguments') from error
+        raise InputError(f'ROS 2 does not start: {str(error).splitlines()[0]}', advice) from error
     try:
-        module, name = node.split(':')
-        _spin(getattr(import_module(module, __package__), name)(), came)
+        yield
     finally:
         # rclpy.try_shutdown() would also restore signal handlers, for an instant the default ones.
         rclpy.get_default_context().try_shutdown()
@@ -122,8 +115,6 @@ def _spin(node: Any, came: int) -> None:
     """Run a node until a signal came."""
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.task import Future
-
-    from .declare import misspelt
     try:
         from rclpy.experimental import EventsExecutor as Executor  # it has the least overhead
     except ImportError:
@@ -139,8 +130,12 @@ def _spin(node: Any, came: int) -> None:
     sys.setswitchinterval(_SWITCH)
     try:
         node.start()
-        for line in misspelt(node):
-            node.get_logger().error(line)
+        known = list(node.get_parameters_by_prefix(''))
+        for name in node._parameter_overrides:
+            if not name.startswith('qos_overrides.') and not node.has_parameter(name):
+                near = ' or '.join(get_close_matches(name, known)) or 'one of ros2 param list'
+                node.get_logger().error(
+                    f'there is no parameter {name}, expected {near}: correct the name')
         gc.freeze()  # permanent objects are not scanned again, which would take tens of ms
         Thread(target=end, daemon=True).start()
         while node.context.ok() and not ended.done():

@@ -126,14 +126,7 @@ class SimulatedImu:
         self._up, self._path = self._path[0, :3] if len(self._path) else self._up, self._path[:0]
         self._append(up)
 
-    def turn_on(self) -> bool:
-        """Let the sensor turn to the next pose now; return whether there is one."""
-        up = self._next()
-        if up is not None:
-            self.turn_to(up)
-        return up is not None
-
-    def _next(self) -> Floats | None:
+    def advance(self) -> Floats | None:
         """Return the direction of the next pose, which is then one of those so far; None: over."""
         up = next(self._coming, None)
         self.next_pose += up is not None
@@ -143,7 +136,7 @@ class SimulatedImu:
         """Return the next samples [g], at most this number; none after the end."""
         settings = self._settings
         while (lacking := count - len(self._path)) > 0:
-            up = self._next() if self._resting else None
+            up = self.advance() if self._resting else None
             if up is not None:
                 self._append(up)
             elif settings.hold or not self._resting:
@@ -212,7 +205,10 @@ class SimulatorNode(Node):
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _on_next(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._simulated.turn_on()
+        up = self._simulated.advance()
+        if up is not None:
+            self._simulated.turn_to(up)
+        response.success = up is not None
         response.message = (
             f'turning to pose {self._simulated.next_pose}' if response.success else
             f'all {self.settings.poses} poses are taken, expected another one: restart the '
@@ -232,27 +228,23 @@ class SimulatorNode(Node):
                 return
             self._began, self._began_steady = self.get_clock().now(), now
         due = int((now - self._began_steady) * self.settings.rate) + 1
-        samples = self._simulated.samples(due - self._sent)
+        samples, gravity = self._simulated.samples(due - self._sent), self.settings.gravity
         for row in range(len(samples)):
-            self._send(samples, row)
+            after_start = round(self._sent / self.settings.rate * 1e9)
+            stamp = Time(nanoseconds=self._began.nanoseconds + after_start).to_msg()
+            header, message = Header(stamp=stamp, frame_id=self.settings.frame_id), self._message
+            message.header = header
+            message.linear_acceleration = vector3(samples.reading[row] * gravity)
+            message.angular_velocity = vector3(samples['rate'][row])
+            self._imu.publish(message)
+            self._truth.publish(Vector3Stamped(
+                header=header, vector=vector3(samples['reference'][row] * gravity)))
+            if self._sent % max(1, round(_TEMPERATURE_EVERY * self.settings.rate)) == 0:
+                self._temperature.publish(Temperature(
+                    header=header, temperature=float(samples['temperature'][row])))
             self._sent += 1
         if self._sent < due:
             self.context.try_shutdown()
-
-    def _send(self, samples: Recording, row: int) -> None:
-        after_start = round(self._sent / self.settings.rate * 1e9)
-        stamp = Time(nanoseconds=self._began.nanoseconds + after_start).to_msg()
-        header = Header(stamp=stamp, frame_id=self.settings.frame_id)
-        gravity, message = self.settings.gravity, self._message
-        message.header = header
-        message.linear_acceleration = vector3(samples.reading[row] * gravity)
-        message.angular_velocity = vector3(samples['rate'][row])
-        self._imu.publish(message)
-        self._truth.publish(Vector3Stamped(
-            header=header, vector=vector3(samples['reference'][row] * gravity)))
-        if self._sent % max(1, round(_TEMPERATURE_EVERY * self.settings.rate)) == 0:
-            self._temperature.publish(Temperature(
-                header=header, temperature=float(samples['temperature'][row])))
 
     def close(self) -> None:
         """Do nothing, because there is nothing to finish."""
@@ -260,4 +252,4 @@ class SimulatorNode(Node):
 
 def vector3(numbers: Floats) -> Vector3:
     """Return a (3,) array as a message."""
-    return Vector3(x=float(numbers[0]), y=float(numbers[1]), z=float(numbers[2]))
+    return Vector3(**dict(zip('xyz', numbers.tolist())))

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib import import_module
 from itertools import groupby
 import math
@@ -30,14 +31,13 @@ from rclpy.validate_topic_name import validate_topic_name
 from sensor_msgs.msg import Imu
 
 from .declare import published_by_others, SENSOR
-from ..calibration import Calibration
 from ..errors import AccelCalibError, InputError
 from ..logs import (
     ACCELERATION, field_of, IMU_DOUBLES, joined, Layout, layout_of, LITTLE_ENDIAN, NAME_AT,
-    samples_of, THREE, topic_and_field)
+    named_topics, samples_of, THREE, topic_and_field)
 from ..messages.correction import motion_of, output_frame, Rewriter
 from ..messages.one_reading import Triple
-from ..session import Around, BATCH, CalibratorSettings, columns_of, context_topics, Session, State
+from ..session import Around, BATCH, CalibratorSettings, columns_of, Session
 from ..table import Floats
 from ..text import some
 
@@ -51,30 +51,14 @@ _NO_LAYOUT = Layout(b'', 0, -1)
 _NO_BIAS = np.zeros(3)
 
 
+@dataclass(eq=False)
 class Output:
-    """A publisher of corrected messages, with the prepared correction, if it has listeners."""
+    """A publisher of corrected messages, with the correction, and what that is `made_for`."""
 
-    def __init__(self, publisher: Any) -> None:
-        self._publisher = publisher
-        self.publish = publisher.publish
-        self.listeners = 0
-        self.rewriter: Rewriter | None = None
-        self._made_for: tuple[object, ...] = ()
-
-    def prepare(self, layout: Layout, calibration: Calibration | None, state: State) -> None:
-        """Count the subscribers, and prepare the correction by this calibration for them."""
-        self.listeners = self._publisher.get_subscription_count()
-        settings, sensor = state.settings, state.sensor
-        fills = settings.fill_covariance and sensor.noise is not None
-        made_for = layout, calibration, settings, fills
-        if self._made_for and all(map(operator.is_, made_for, self._made_for)):
-            return
-        self._made_for, self.rewriter = made_for, None
-        if calibration is not None:
-            frame_id = output_frame(calibration, layout.frame_id, settings.output_frame_id)
-            self.rewriter = Rewriter(layout, calibration, settings.gravity, frame_id,
-                                     sensor.noise if fills else None,
-                                     sensor.temperatures.stream(calibration.model))
+    publisher: Any
+    listeners: int = 0
+    rewriter: Rewriter | None = None
+    made_for: tuple[object, ...] = (None,) * 4
 
 
 _WITH_A_NUMBER = tuple(f'{package}/msg/{name}' for package, names in (
@@ -118,7 +102,7 @@ class ContextTopics:
 
     def __init__(self, node: Node, settings: CalibratorSettings) -> None:
         self._node, self._waiting, self._missing = node, dict[str, str](), dict[str, str]()
-        for column, asked in context_topics(settings).items():
+        for column, asked in named_topics(settings.context).items():
             topic, _, field = asked.rpartition('/')  # a field within a field is no name
             whole, field = (topic, f'/{field}') if '.' in field and topic else (asked, '')
             try:
@@ -134,6 +118,7 @@ class ContextTopics:
         for column, asked in list(self._waiting.items()):
             topic, field = topic_and_field(asked, types)
             kinds = types.get(topic, [])
+            names = ' and '.join(kinds).replace('/msg/', '/')  # as in the documentation of ROS
             kind = _type_of(kinds[0]) if len(kinds) == 1 else None
             numbers = [] if kind is None else _fields_of(kind)
             read = field_of(column, numbers, field)
@@ -143,7 +128,7 @@ class ContextTopics:
                 usable = f'; topics with a number: {", ".join(others)}' if others else ''
                 have = f'the numbers {some(numbers)}' if numbers else 'no number that can be read'
                 found = f'there is no topic {topic}: start its driver, or' if not kinds else (
-                    f'{topic} has the type {" and ".join(map(_short, kinds))} with {have}, '
+                    f'{topic} has the type {names} with {have}, '
                     f'expected {field or "one, or its name after the topic"}:')
                 self._missing[column] = (
                     f'{found} correct context, and restart the node{usable}')
@@ -153,13 +138,8 @@ class ContextTopics:
             self._node.create_subscription(
                 kind, topic, lambda message, column=column, value=value: around.take(
                     column, float(value(message))), SENSOR)
-            self._missing[column] = f'nothing comes on {topic} ({_short(kinds[0])})'
+            self._missing[column] = f'nothing comes on {topic} ({names})'
         return self._missing
-
-
-def _short(name: str) -> str:
-    """Return the name of a type as in the documentation of ROS."""
-    return name.replace('/msg/', '/')
 
 
 class Stream:
@@ -207,7 +187,7 @@ class Stream:
         layout = self._layout
         if (len(data) != layout.size or data[:4] != LITTLE_ENDIAN
                 or data[NAME_AT:layout.name_end] != layout.name):
-            usual = self._adopted(data)
+            usual = self._adopt(data)
             if usual is None:
                 self._on_events()
                 return
@@ -230,18 +210,25 @@ class Stream:
             self._pass_on()
 
     def _prepare(self) -> None:
-        """Prepare the outputs."""
+        """Count the subscribers of the outputs, and prepare the corrections for them."""
         state = self._state = self._session.state
-        sensor = state.sensor
-        gyro = sensor.gyro if state.settings.gyro_bias else None
+        settings, sensor, layout = state.settings, state.sensor, self._layout
+        gyro, noise = sensor.gyro if settings.gyro_bias else None, (
+            sensor.noise if settings.fill_covariance else None)
         bias = _NO_BIAS if gyro is None else gyro.at(state.around.temperature)
         for output, calibration in zip(self._outputs, (sensor.applied, sensor.previewed, None)):
-            output.prepare(self._layout, calibration, state)
+            output.listeners = output.publisher.get_subscription_count()
+            made_for = layout, calibration, settings, noise is None
+            if not all(map(operator.is_, made_for, output.made_for)):
+                output.made_for, output.rewriter = made_for, None if calibration is None else (
+                    Rewriter(layout, calibration, settings.gravity, output_frame(
+                        calibration, layout.frame_id, settings.output_frame_id), noise=noise,
+                        thermal=sensor.temperatures.stream(calibration.model)))
             if output.rewriter is not None:
                 output.rewriter.bias = tuple(bias.tolist())
         self._listened = self._active and any(output.listeners for output in self._outputs)
 
-    def _adopted(self, data: bytes) -> bytes | None:
+    def _adopt(self, data: bytes) -> bytes | None:
         """Return a message with a new layout as usual; None: not readable, or another sensor."""
         layout = layout_of(data)
         if layout is None:  # not in the usual encoding
@@ -269,7 +256,7 @@ class Stream:
             self._rewrite(data, self._preview)
         if not state.enabled or (sensor.calibration is None and state.settings.passthrough):
             if math.isfinite(sum(THREE.unpack_from(data, self._layout.place(ACCELERATION)))):
-                self._calibrated.publish(data)
+                self._calibrated.publisher.publish(data)
         elif self._calibrated.listeners or self._motion.listeners:
             self._rewrite(data, self._calibrated)
 
@@ -286,10 +273,10 @@ class Stream:
         if corrected is None:
             return
         if output.listeners:
-            output.publish(corrected)
+            output.publisher.publish(corrected)
         gravity = self._state.sensor.gravity
         if self._motion.listeners and gravity is not None and output is self._calibrated:
-            self._motion.publish(motion_of(corrected, rewriter.layout, gravity))
+            self._motion.publisher.publish(motion_of(corrected, rewriter.layout, gravity))
 
     def flush_if_due(self) -> None:
         """Pass the waiting messages to the session, unless the next message does it in time."""

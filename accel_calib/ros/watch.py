@@ -15,13 +15,12 @@ from functools import partial
 from time import monotonic
 
 from diagnostic_msgs.msg import DiagnosticStatus
-import rclpy
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 
 from .declare import LATCHED
+from .run import started
 from ..errors import InputError
 from ..session import Progress
 
@@ -49,7 +48,7 @@ class _Receiver(Node):
     def __init__(self, name: str) -> None:
         # A leading underscore hides the node from ros2 node list.
         super().__init__('_accel_calib_watch', enable_rosout=False, start_parameter_services=False)
-        self._arrived = monotonic()
+        self.arrived = monotonic()  # of the last message, or the start
         self.progress: Progress | None = None
         self.received = 0
         try:
@@ -63,21 +62,13 @@ class _Receiver(Node):
 
     def _on_message(self, message: DiagnosticStatus) -> None:
         self.progress = Progress.from_figures({each.key: each.value for each in message.values})
-        self._arrived = monotonic()
+        self.arrived = monotonic()
         self.received += 1
 
-    @property
-    def silence(self) -> float:
-        """Time since the last message, or since the start [s]."""
-        return monotonic() - self._arrived
-
-    @property
-    def is_silent(self) -> bool:
-        """Whether a message is overdue."""
-        return self.silence > (_SILENT if self.received else _FIRST)
-
-    def problem(self) -> tuple[str, str]:
-        """Return what was found and expected, and what to do, if no messages arrive."""
+    def problem(self) -> tuple[str, ...]:
+        """Return what was found and expected, and what to do, if a message is overdue."""
+        if monotonic() - self.arrived <= (_SILENT if self.received else _FIRST):
+            return ()
         topic = self._topic
         others = [name.removesuffix(_SUFFIX) for name, kinds in self.get_topic_names_and_types()
                   if name.endswith(_SUFFIX) and 'diagnostic_msgs/msg/DiagnosticStatus' in kinds
@@ -108,9 +99,7 @@ def watch(name: str, show: Show, is_over: Callable[[], bool], args: Sequence[str
         show(receiver.calibrator, None, problem)
         while not is_over():
             spin()
-            before, problem = problem, ''
-            if receiver.is_silent:
-                problem = '; '.join(receiver.problem())
+            before, problem = problem, '; '.join(receiver.problem())
             if receiver.received != shown or problem != before:
                 shown = receiver.received
                 show(receiver.calibrator, receiver.progress, problem)
@@ -127,25 +116,18 @@ def current(name: str, is_over: Callable[[], bool], args: Sequence[str] = ()
     with _receiver(name, args) as (receiver, spin):
         while receiver.received < 2 and not is_over():
             spin()
-            if receiver.received and receiver.silence > _NEXT:
+            if receiver.received and monotonic() - receiver.arrived > _NEXT:
                 break
-            if receiver.is_silent:
-                raise InputError(*receiver.problem())
+            if problem := receiver.problem():
+                raise InputError(*problem)
         return receiver.calibrator, receiver.progress
 
 
 @contextmanager
 def _receiver(name: str, args: Sequence[str]) -> Iterator[tuple[_Receiver, Callable[[], None]]]:
-    """Yield a receiver, and what waits for its messages; the process keeps its signal handlers."""
-    try:
-        rclpy.init(args=list(args), signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as err:
-        raise InputError(f'ROS 2 does not start: {str(err).splitlines()[0]}',
-                         'check the arguments after --ros-args') from err
-    try:
+    """Yield a receiver, and what waits for its messages."""
+    with (started(list(args), 'check the arguments after --ros-args'),
+          SingleThreadedExecutor() as executor):
         receiver = _Receiver(name)
-        with SingleThreadedExecutor() as executor:
-            executor.add_node(receiver)
-            yield receiver, partial(executor.spin_once, timeout_sec=_LOOK_EVERY)
-    finally:
-        rclpy.try_shutdown()
+        executor.add_node(receiver)
+        yield receiver, partial(executor.spin_once, timeout_sec=_LOOK_EVERY)

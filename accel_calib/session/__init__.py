@@ -16,25 +16,24 @@ one way.
 """
 
 from . import state
-from .commands import COMMANDS, enable, run
+from .commands import BUTTONS, COMMANDS, enable, run
 from .conditions import APART, conditions, next_step
 from .core import State, Surroundings
 from .sensor import title
 from .session import BATCH, Session
 from .settings import (
-    CalibratorSettings, changed, columns_of, context_topics, default_of, expected, parameter,
-    Settings, WEB_PORT)
-from .state import Check, checks, diagnostics, figures, Progress, progress, words_of_state
+    CalibratorSettings, changed, columns_of, default_of, expected, parameter, Settings, WEB_PORT)
+from .state import Check, diagnostics, figures, Progress, progress, words_of_state
 from .store import ros_home
 from .stream import Around
 from .worker import (
     Answer, answered, CallSoon, Compute, Event, Files, Log, Mounting, nothing, Result, Severity,
     ShowPoses, Step, Still, Task, Throttle, Worker, WorkerProcess)
 
-__all__ = ['APART', 'BATCH', 'COMMANDS', 'WEB_PORT', 'Answer', 'Around', 'CalibratorSettings',
-           'CallSoon', 'Check', 'Compute', 'Event', 'Files', 'Log', 'Mounting', 'Progress',
-           'Result', 'Session', 'Settings', 'Severity', 'ShowPoses', 'State', 'Step', 'Still',
-           'Surroundings', 'Task', 'Throttle', 'Worker', 'WorkerProcess', 'answered', 'changed',
-           'checks', 'columns_of', 'conditions', 'context_topics', 'default_of', 'diagnostics',
-           'enable', 'expected', 'figures', 'next_step', 'nothing', 'parameter', 'progress',
-           'ros_home', 'run', 'state', 'title', 'words_of_state']
+__all__ = ['APART', 'BATCH', 'BUTTONS', 'COMMANDS', 'WEB_PORT', 'Answer', 'Around',
+           'CalibratorSettings', 'CallSoon', 'Check', 'Compute', 'Event', 'Files', 'Log',
+           'Mounting', 'Progress', 'Result', 'Session', 'Settings', 'Severity', 'ShowPoses',
+           'State', 'Step', 'Still', 'Surroundings', 'Task', 'Throttle', 'Worker',
+           'WorkerProcess', 'answered', 'changed', 'columns_of', 'conditions', 'default_of',
+           'diagnostics', 'enable', 'expected', 'figures', 'next_step', 'nothing', 'parameter',
+           'progress', 'ros_home', 'run', 'state', 'title', 'words_of_state']

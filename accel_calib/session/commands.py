@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -48,9 +49,9 @@ class ChangedError(AccelCalibError):
 
 
 def run(session: Holder, name: str, *, offers: bool = False) -> Task:
-    """Run one of `COMMANDS`, and note why it is refused; `offers`: only offer what is new."""
+    """Run one of `BUTTONS`, and note why it is refused; `offers`: only offer what is new."""
     try:
-        found = COMMANDS[name](session)
+        found = BUTTONS[name](session)
         if isinstance(found, Generator):
             found = yield from found
         if isinstance(found, Fitted):
@@ -70,7 +71,7 @@ def capture_pose(session: Holder) -> Task:
     sensor.live.capture(dwell)
     session.change_sensor(guide=replace(sensor.guide, rest=dwell.start))  # the answer is its line
     poses_changed(session, ended=False)
-    poses = sensor.live.book.poses()
+    poses = sensor.live.poses()
     words = (f'{counted(len(poses), "pose")}: the sensor has been still for '
              f'{dwell.end - dwell.start:.1f} s')
     if session.state.computing:
@@ -89,7 +90,7 @@ def undo_pose(session: Holder) -> Task:
     if not session.sensor.live.undo():
         raise InputError('there are no poses to remove', 'capture a pose first')
     poses_changed(session, ended=False)
-    count = len(session.sensor.live.book.poses())
+    count = len(session.sensor.live.poses())
     yield Files(nothing)  # until the poses are stored
     return f'the last pose is removed; remaining: {counted(count, "pose")}'
 
@@ -98,7 +99,7 @@ def poses_changed(session: Holder, *, ended: bool, new_rest: Dwell | None = None
     """Draw and store the poses, and fit if auto_fit is set; `ended`: a rest has ended."""
     sensor = session.sensor
     show_poses(session, store=session.state.files.lock is not None, new_rest=new_rest)
-    if ended or len(sensor.live.book.poses()) > sensor.fitted_poses:
+    if ended or len(sensor.live.poses()) > sensor.fitted_poses:
         session.change_sensor(auto_fit_waits=True)
     fit_if_due(session)
 
@@ -107,7 +108,7 @@ def fit_if_due(session: Holder) -> None:
     """Add an automatic fit to the events if one is due."""
     sensor, settings = session.sensor, session.state.settings
     if (settings.auto_fit and sensor.auto_fit_waits and session.state.files.lock is not None
-            and len(sensor.live.book.poses()) >= settings.auto_fit_poses
+            and len(sensor.live.poses()) >= settings.auto_fit_poses
             and session.throttle.passes('auto_fit', _AUTO_FIT_EVERY)):
         session.change_sensor(auto_fit_waits=False)
         session.events.append(_auto_fit(session, sensor))
@@ -138,31 +139,29 @@ def _auto_fit(session: Holder, sensor: Sensor) -> Task:
 
 def fit(session: Holder) -> Part[Fitted]:
     """Fit the poses; the values of a refined calibration are fitted anew."""
-    state = session.state
-    return (yield from _compute(session, fitting.fit, state.units, state.settings, state.name,
-                                state.sensor.present))
+    return (yield from _compute(session, fitting.fit, settings=session.state.settings))
 
 
 def refine(session: Holder) -> Part[Fitted]:
     """Refine the calibration."""
     state = session.state
     hint = '' if 'temperature' in state.around.values else thermometer_words(state)
-    fitted = yield from _compute(session, fitting.refine, state.units, state.name,
-                                 state.sensor.present, hint, state.own)
-    session.change_sensor(guide=session.sensor.guide.follow(fitted.refinement.plan.poses))
+    fitted = yield from _compute(session, fitting.refine, hint=hint, own=state.own)
+    guide, planned = session.sensor.guide, fitted.refinement.plan.poses
+    session.change_sensor(guide=replace(guide, planned=planned or None, begun=guide.poses))
     return fitted
 
 
-def _compute(session: Holder, function: Callable[..., Fitted], *given: Any) -> Part[Any]:
+def _compute(session: Holder, function: Callable[..., Fitted], **given: Any) -> Part[Any]:
     """Return what a function makes of the poses; fail if it is not fit for use, or outdated."""
     session.state.files.usable()
-    sensor, name = session.sensor, function.__name__
-    sensor.live.refresh()
-    count = len(sensor.live.book.poses())
-    session.change(computing=session.state.computing + 1)
+    state, sensor, name = session.state, session.sensor, function.__name__
+    session.change(computing=state.computing + 1)
     try:
-        poses = sensor.live.poses(session.state.found)
-        found = yield Compute(function, poses, *given)
+        poses = sensor.live.poses_for_fit(state.found)
+        count = len(sensor.live.poses())
+        found = yield Compute(function, poses, units=state.units, sensor=state.name,
+                              before=sensor.present, **given)
     except RefusedFitError as error:
         session.refuse('poses', error.advice)
         raise
@@ -171,11 +170,15 @@ def _compute(session: Holder, function: Callable[..., Fitted], *given: Any) -> P
     if session.sensor.live is not sensor.live or session.sensor.changes != sensor.changes:
         raise ChangedError(f'another command changed the calibration during ~/{name}; '
                            'the result is discarded', f'call ~/{name} again')
-    if found.refusal:
-        why, advice = found.refusal
+    rating, refinement = found.rating, found.refinement
+    refusal = (rating.reason, rating.next.text) if rating.name == 'BAD' else ()
+    if refinement is not None and refinement.refusal:
+        refusal = refinement.refusal
+    if refusal:
+        why, advice = refusal
         session.refuse('poses', advice)
-        if found.refinement is not None:
-            rate(session, found.refinement)
+        if refinement is not None:
+            rate(session, refinement)
         raise RefusedFitError(f'{found.words}; not used: {why}', advice)
     session.change_sensor(fitted_poses=count)
     return found
@@ -211,7 +214,7 @@ def set_level(session: Holder) -> Fitted:
     state, rest = session.state, _rest(session.state)
     calibration = state.sensor.present or state.with_given(mounting_only(
         poses_from([rest]), state.units, sensor=state.name, date=now()))
-    return _levelled(state, calibration, rest, 'the mounting is levelled by this pose')
+    return _mount(state, calibration, 'the mounting is levelled by this pose', rest)
 
 
 def set_heading(session: Holder) -> Fitted:
@@ -226,7 +229,7 @@ def set_heading(session: Holder) -> Fitted:
     if headed.rotation[:, 0] @ calibration.rotation[:, 0] < 0.0:
         words += ('; the front of the robot is now on the other side of the sensor: if the '
                   'nose was up, tilt it down and call ~/set_heading again')
-    return _mounted(session.sensor, headed, words)
+    return _mount(session.state, headed, words)
 
 
 def calibrate_at_rest(session: Holder) -> Fitted:
@@ -244,26 +247,24 @@ def calibrate_at_rest(session: Holder) -> Fitted:
     if gyro is not None:
         bias = ', '.join(f'{np.degrees(part):+.3f}' for part in gyro.bias)
         words += f', gyro bias ({bias}) °/s'
-    return _levelled(state, state.with_given(replace(found, gyro=gyro)), rest, words)
+    return _mount(state, state.with_given(replace(found, gyro=gyro)), words, rest)
 
 
-def _levelled(state: State, calibration: Calibration, rest: Dwell, words: str) -> Fitted:
-    """Return a calibration levelled by a rest; check it against the given mounting."""
-    levelled = level(calibration, rest.mean, state.frame,
-                     state.sensor.context_of(rest, calibration))
-    if not np.allclose(state.with_given(levelled).rotation[:, 2], levelled.rotation[:, 2]):
-        raise InputError('this pose differs by more than 10° of tilt from the mounting in '
-                         'mounting_rpy or base_frame', 'place the robot level, or correct the '
-                         'given mounting and restart the node')
-    return _mounted(state.sensor, levelled, words)
-
-
-def _mounted(sensor: Sensor, calibration: Calibration, words: str) -> Fitted:
-    """Return a calibration with a new mounting, and the answer."""
-    details = [change_words(sensor.present, calibration), *(
+def _mount(state: State, calibration: Calibration, words: str, rest: Dwell | None = None
+           ) -> Fitted:
+    """Return a calibration with a new mounting, levelled by a rest if there is one."""
+    if rest is not None:
+        calibration = level(calibration, rest.mean, state.frame,
+                            state.sensor.context_of(rest, calibration))
+        up = calibration.rotation[:, 2]
+        if not np.allclose(state.with_given(calibration).rotation[:, 2], up):
+            raise InputError('this pose differs by more than 10° of tilt from the mounting in '
+                             'mounting_rpy or base_frame', 'place the robot level, or correct the '
+                             'given mounting and restart the node')
+    details = [change_words(state.sensor.present, calibration), *(
         each.words for each in calibration.noted if each.kind in ('flat_pose', 'heading'))]
     return Fitted(calibration, f'{words}; {angle_words(calibration.rotation)}', details,
-                  refinement=sensor.refinement)
+                  refinement=state.sensor.refinement)
 
 
 def _rest(state: State) -> Dwell:
@@ -302,7 +303,7 @@ def save(session: Holder) -> Task:
     if calibration is None:
         raise InputError('there is no calibration', 'capture poses and call ~/fit first')
     yield Files(store.write, Parse(store.prepared, calibration))
-    yield Files(store.save_poses, sensor.live.book.poses())
+    yield Files(store.save_poses, sensor.live.poses())
     if session.sensor.live is sensor.live:
         session.change_sensor(unsaved=False)
         if session.sensor.offered is calibration:
@@ -364,7 +365,7 @@ def _alone(session: Holder, step: Parse) -> Part[Any]:
 COMMANDS: dict[str, Callable[[Holder], Any]] = {each.__name__: each for each in (
     capture_pose, undo_pose, fit, refine, set_level, set_heading, calibrate_at_rest, save, undo,
     load, reset)}
-"""The commands without an argument, which are services of the node and buttons of the page."""
+"""The commands without an argument, which are services of the node."""
 
 
 def enable(session: Holder, on: bool) -> str:
@@ -377,3 +378,8 @@ def enable(session: Holder, on: bool) -> str:
         return (f'the correction is on, but there is no calibration yet: {published} '
                 'published; capture poses and call ~/fit')
     return 'the correction is on: corrected messages are published'
+
+
+BUTTONS: dict[str, Callable[[Holder], Any]] = {
+    **COMMANDS, 'enable': partial(enable, on=True), 'disable': partial(enable, on=False)}
+"""The commands of the page."""

@@ -19,16 +19,16 @@ import math
 from typing import Any
 
 from .core import State
-from .pose_guide import Guide, NOT_FOLLOWED
-from .settings import context_topics
-from .stream import SILENT, StreamStatistics
+from .pose_guide import Guide
+from .stream import SILENT
 from ..comparison import status
 from ..finding import Finding, NextStep
 from ..findings import outside_words, request_words, USES_LIMIT
+from ..logs import named_topics
 from ..pipeline import FEWEST_IN_CONE, is_partial
 from ..table import column_of, CONTEXT, is_quantity
 from ..text import counted
-from ..units import MG, Units
+from ..units import MG
 
 CONCERNS = {'step': 'calibration', 'unusable': 'calibration', 'switched_off': 'calibration',
             'outside': 'calibration', 'changed': 'drift', 'read_only': 'storage',
@@ -59,13 +59,19 @@ _LEVEL = _step('level', 'place the robot level, hold it still and call ~/set_lev
 _FAR = 0.25
 """Part of the range of a calibration beyond which poses are asked for."""
 
+_WITHOUT_NEW = 30.0
+"""Time without a new pose after which the robot probably cannot be turned further [s]."""
+
+_NOT_FOLLOWED = 3
+"""Number of requests in a row that are not followed, with the same meaning."""
+
 _NEEDS_SAMPLES = ('poses', 'level', 'done', '')
 """Kinds of steps that need samples; the others use the poses so far."""
 
 
 def conditions(state: State) -> list[Finding]:
     """Return what is the case and what to do about it; the next step is that of the first one."""
-    step, files, of_use = _ordinary(state), [], list(_use(state))
+    step, files, of_use = _feasible_step(state), [], list(_check_use(state))
     if state.problem:
         files.append(Finding('unusable', state.problem, level='BAD'))
     store = state.files.store
@@ -76,7 +82,7 @@ def conditions(state: State) -> list[Finding]:
     blocks = bool(state.files.problem) or state.is_refused
     first, files = (files[:1], files[1:]) if blocks else ([], files)
     ended = state.surroundings.ended
-    around = [] if ended else [*_stream(state), *_context(state)]
+    around = [] if ended else [*_check_stream(state), *_check_context(state)]
     if step.step == 'level' and ended:  # nothing can be levelled any more
         step = replace(step, step='done', text='use the calibration', command='')
     if step.step not in _NEEDS_SAMPLES:
@@ -106,20 +112,34 @@ def next_words(state: State) -> str:
 
 # ----------------------------------------------------------------------------- poses and fits
 
-def _ordinary(state: State) -> Finding:
-    """Return the next step of a calibration of which nothing is in the way."""
-    step = _with_sensor(state)
-    refusal = state.refusal_of(step.command)
+def _feasible_step(state: State) -> Finding:
+    """Return the next step of a calibration; also for a robot that cannot be turned further."""
+    step, guide, present = _ordinary_step(state), state.sensor.guide, state.sensor.present
+    refusal, is_refused = state.refusal_of(step.command), bool(state.refusal_of('poses'))
     if refusal and step.step != 'poses':
         step = replace(step, text=refusal, command='')
     if step.step == 'poses' and step.kind == 'step':
-        step, turning = _within_reach(state, step), slow_turn(state)
-        step = replace(step, text=f'{turning}; {step.text}') if turning else step
+        is_missed = guide.missed >= _NOT_FOLLOWED
+        is_stuck = (is_refused or is_missed
+                    or state.statistics.stamp - guide.new_at >= _WITHOUT_NEW)
+        if is_stuck and present is not None and (is_partial(present) or is_missed):
+            step = _LEVEL if not present.is_levelled else _step(
+                'done', f'use the calibration in these orientations; for others: {step.text}')
+        elif is_stuck and present is None and not is_refused and (
+                guide.poses >= FEWEST_IN_CONE and not state.refusal_of('fit')):
+            step = replace(step, text=f'{step.text}; if it cannot be turned further, call ~/fit',
+                           command='fit')
+        elif is_stuck and present is None and not state.refusal_of('calibrate_at_rest'):
+            step = replace(step, text=f'{step.text}; if it cannot be turned over, place the robot '
+                           'level, hold it still and call ~/calibrate_at_rest',
+                           command='calibrate_at_rest')
+        if turning := slow_turn(state):
+            step = replace(step, text=f'{turning}; {step.text}')
     missing = state.sensor.calibration is None and step.level == 'GOOD'
     return replace(step, level='USABLE') if missing else step
 
 
-def _with_sensor(state: State) -> Finding:
+def _ordinary_step(state: State) -> Finding:
     """Return the next step with the poses and calibrations of the sensor."""
     sensor, rating, guide = state.sensor, state.sensor.rating, state.sensor.guide
     if sensor.offered is not None:
@@ -166,26 +186,6 @@ def step_of(guide: Guide) -> Finding:
                  'fit' if asked.fits else '', direction=tuple(asked.direction.tolist()))
 
 
-def _within_reach(state: State, step: Finding) -> Finding:
-    """Return a step that a robot which cannot be turned further can do, too."""
-    guide, present = state.sensor.guide, state.sensor.present
-    is_refused = bool(state.refusal_of('poses'))
-    if not (is_refused or guide.is_stuck(state.statistics.stamp)):
-        return step
-    if present is None and not is_refused and guide.poses >= FEWEST_IN_CONE and not (
-            state.refusal_of('fit')):
-        return replace(step, text=f'{step.text}; if it cannot be turned further, call ~/fit',
-                       command='fit')
-    if present is None and not state.refusal_of('calibrate_at_rest'):
-        return replace(step, text=f'{step.text}; if it cannot be turned over, place the robot '
-                       'level, hold it still and call ~/calibrate_at_rest',
-                       command='calibrate_at_rest')
-    if present is None or not (is_partial(present) or guide.missed >= NOT_FOLLOWED):
-        return step
-    return (_step('done', f'use the calibration in these orientations; for others: '
-                  f'{step.text}') if present.is_levelled else _LEVEL)
-
-
 def slow_turn(state: State) -> str:
     """Return that the sensor turns slowly, and what to do; empty if it is still or shaken."""
     statistics, live = state.statistics, state.sensor.live
@@ -195,7 +195,7 @@ def slow_turn(state: State) -> str:
     return f'turning slowly, {rate:.1f} °/s: rest it on something' if rate else ''
 
 
-def _use(state: State) -> Iterator[Finding]:
+def _check_use(state: State) -> Iterator[Finding]:
     """Yield what is wrong with the use of the calibration."""
     if not state.enabled:
         yield Finding('switched_off', 'correction switched off, raw messages are published: call '
@@ -209,11 +209,11 @@ def _use(state: State) -> Iterator[Finding]:
 
 # ----------------------------------------------------------------------------- samples
 
-def _context(state: State) -> Iterator[Finding]:
+def _check_context(state: State) -> Iterator[Finding]:
     """Yield the columns of the context that are missing, why, and what follows."""
     calibration, around, outside = state.sensor.calibration, state.around, state.surroundings
     needs = () if calibration is None else calibration.model.needs
-    wanted = [*context_topics(state.settings), *(
+    wanted = [*named_topics(state.settings.context), *(
         key for key in needs if key in CONTEXT or is_quantity(key))]
     for column in filter(around.is_missing, dict.fromkeys(wanted)):
         why = outside.missing.get(column) or (
@@ -258,61 +258,43 @@ _UNITS = (('g', 0.8, 1.2), ('m/s2', 8.0, 12.0))
 """Units with the lowest and highest |reading| of a resting sensor in this unit."""
 
 
-def _stream(state: State) -> list[Finding]:
+def _check_stream(state: State) -> list[Finding]:
     """Return what is wrong with the messages, and what to do."""
-    statistics, around = state.statistics, state.surroundings
-    names, unit = around.publishers or (), _wrong_unit(statistics, state.units)
-    found = {'mismatches': '; '.join(around.mismatches),
-             'silence' if names else 'no_publisher': _silence(state)}
-    if len(names) > 1:
+    topic, statistics, around = state.topic, state.statistics, state.surroundings
+    units, live, names = state.units, state.sensor.live, around.publishers
+    found = {'mismatches': '; '.join(around.mismatches)}
+    if not around.mismatches and min(statistics.age, statistics.dropped_ago) > SILENT:
+        there = f', such as {" or ".join(around.imus)}' if around.imus else ''
+        found['silence' if names else 'no_publisher'] = (
+            f'{topic} sends no samples: check the board, its cable and its program; the poses are '
+            'kept' if names is None else
+            f'no Imu messages on {topic}, although {names[0]} publishes there: check the driver'
+            if names else
+            f'no Imu messages on {topic}, and no publisher: start the driver, or remap '
+            f'imu/data_raw to its topic{there}')
+    if names and len(names) > 1:
         found['publishers'] = (
-            f'{"two" if len(names) == 2 else len(names)} publishers on the topic {state.topic}: '
+            f'{"two" if len(names) == 2 else len(names)} publishers on the topic {topic}: '
             f'{", ".join(names)}; expected one sensor: stop the others, or give each sensor its '
             'own topic; a driver that was killed disappears after about 20 s')
-    found |= {'stamps': statistics.stamp_fault, 'unit': unit}
+    found['stamps'] = statistics.stamp_fault
+    length, size = statistics.length_g(units), statistics.length
+    is_wrong = length < _LIKELY_G[0] or length > _LIKELY_G[1]  # not if it is NaN
+    if is_wrong:
+        likely = next((name for name, low, high in _UNITS if low < size < high), 'native')
+        found['unit'] = f'|a| is {length:.3g} g, expected about 1 g at rest: ' + (
+            'this is linear acceleration, gravity removed: let the driver publish what the '
+            'accelerometer reads' if length < _WITHOUT_GRAVITY_G else
+            f'start the node with units:={likely}')
     if statistics.dropped_ago < _LASTS:
         found |= {kind: f'dropped {counted(statistics.dropped[kind], what)} {why}'
                   for kind, (what, why) in _DROPPED.items() if statistics.dropped[kind]}
-    found['vibration'] = '' if unit else _vibration(state)
-    return [Finding(kind, text, level='USABLE') for kind, text in found.items() if text]
-
-
-def _silence(state: State) -> str:
-    topic, around = state.topic, state.surroundings
-    publishers = around.publishers
-    if around.mismatches or (
-            min(state.statistics.age, state.statistics.dropped_ago) <= SILENT):
-        return ''
-    if publishers is None:
-        return (f'{topic} sends no samples: check the board, its cable and its program; the poses '
-                'are kept')
-    if publishers:
-        return (f'no Imu messages on {topic}, although {publishers[0]} publishes there: check '
-                'the driver')
-    there = f', such as {" or ".join(around.imus)}' if around.imus else ''
-    return (f'no Imu messages on {topic}, and no publisher: start the driver, or remap '
-            f'imu/data_raw to its topic{there}')
-
-
-def _wrong_unit(statistics: StreamStatistics, units: Units) -> str:
-    length, size = statistics.length_g(units), statistics.length
-    if not (length < _LIKELY_G[0] or length > _LIKELY_G[1]):
-        return ''
-    if length < _WITHOUT_GRAVITY_G and not units.is_native:
-        return (f'|a| is {length:.3g} g, expected about 1 g at rest: this is linear acceleration, '
-                'gravity removed: let the driver publish what the accelerometer reads')
-    likely = next((name for name, low, high in _UNITS if low < size < high), 'native')
-    return (f'|a| is {length:.3g} g, expected about 1 g at rest: start the node with '
-            f'units:={likely}')
-
-
-def _vibration(state: State) -> str:
-    """Return that the sensor stays in one direction without a rest, and which limit takes it."""
-    live, statistics, units = state.sensor.live, state.statistics, state.units
-    limit, spread = live.detector.threshold, statistics.shaken(state.units.per_g)
-    if not math.isfinite(limit) or spread <= limit or live.still or units.is_native:
-        return ''
-    return (f'no rest: the readings vary by {spread / units.per_g * MG:.1f} mg, a rest by at most '
+    limit, spread = live.detector.threshold, statistics.shaken(units.per_g)
+    if math.isfinite(limit) and spread > limit and not (
+            is_wrong or live.still or units.is_native):  # stays in one direction, but no rest
+        found['vibration'] = (
+            f'no rest: the readings vary by {spread / units.per_g * MG:.1f} mg, a rest by at most '
             f'{limit / units.per_g * MG:.1f} mg: rest the sensor on something and stop what '
-            f'vibrates; if it always does, restart the node with still_std_max:='
+            'vibrates; if it always does, restart the node with still_std_max:='
             f'{1.5 * spread / units.per_g * state.settings.gravity:.2g}')
+    return [Finding(kind, text, level='USABLE') for kind, text in found.items() if text]

@@ -7,15 +7,16 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 import math
+from pathlib import Path
 from typing import Any
 
 from .sensor import new_sensor, Sensor
-from .settings import CalibratorSettings, own_effects
+from .settings import CalibratorSettings
 from .store import SensorFiles
 from .stream import AGAIN, Around, StreamStatistics
 from .worker import Event, Log, Severity, Throttle
 from ..calibration import Calibration, with_given_mounting
-from ..effects import OwnEffect
+from ..effects import effects_of_file, OwnEffect
 from ..errors import InputError
 from ..finding import Finding
 from ..findings import mounting_words
@@ -144,7 +145,7 @@ class State:
     def situation_of(self, command: str) -> tuple[object, ...]:
         """Return what a refusal of a command depends on."""
         live, rests = self.sensor.live, command in ('set_level', 'calibrate_at_rest')
-        return (live, len(live.book.poses()), self.sensor.changes,
+        return (live, len(live.poses()), self.sensor.changes,
                 rests and live.detector.current() is None)
 
     def with_given(self, calibration: Calibration) -> Calibration:
@@ -158,26 +159,9 @@ class State:
         return mounting_words(calibration.rotation, self.frame_id or '', self.settings.base_frame)
 
 
-def begin(settings: CalibratorSettings, topic: str, clock: Callable[[], float]) -> State:
-    """Return the first state of a session; InputError if the settings contradict each other."""
-    if any(settings.mounting_rpy) and settings.base_frame:
-        raise InputError('both mounting_rpy and base_frame are set, expected one of them',
-                         'remove one')
-    if settings.publish_tf and settings.output_frame_id and (
-            settings.output_frame_id == settings.base_frame):
-        raise InputError(f'publish_tf would make {settings.base_frame!r}, the frame of the '
-                         'robot, a child of the frame of the sensor',
-                         'set publish_tf to false, or choose another output_frame_id')
-    units = units_of(settings.units, settings.gravity)
-    return State(
-        settings, topic, units, sensor=new_sensor(settings, units),
-        statistics=StreamStatistics(clock), around=Around(clock), own=own_effects(settings),
-        given=rotation_from_rpy(*settings.mounting_rpy).T if any(settings.mounting_rpy) else None)
-
-
 class Holder:
     """
-    The present state of a session, and what it reports.
+    The present state of a session, and what it reports; parameters and errors as `Session`.
 
     Attributes
     ----------
@@ -190,8 +174,26 @@ class Holder:
 
     """
 
-    def __init__(self, state: State, clock: Callable[[], float]) -> None:
-        self.state = state
+    def __init__(self, settings: CalibratorSettings, topic: str, clock: Callable[[], float],
+                 **known: Any) -> None:
+        if any(settings.mounting_rpy) and settings.base_frame:
+            raise InputError('both mounting_rpy and base_frame are set, expected one of them',
+                             'remove one')
+        if settings.publish_tf and settings.output_frame_id and (
+                settings.output_frame_id == settings.base_frame):
+            raise InputError(f'publish_tf would make {settings.base_frame!r}, the frame of the '
+                             'robot, a child of the frame of the sensor',
+                             'set publish_tf to false, or choose another output_frame_id')
+        try:
+            own = effects_of_file(Path(settings.also).expanduser()) if settings.also else ()
+        except (OSError, RuntimeError) as error:
+            raise InputError(f'also is {settings.also}, which cannot be read: {error}',
+                             'correct the parameter') from error
+        units, rpy = units_of(settings.units, settings.gravity), settings.mounting_rpy
+        self.state = replace(State(
+            settings, topic, units, sensor=new_sensor(settings, units),
+            statistics=StreamStatistics(clock), around=Around(clock), own=own,
+            given=rotation_from_rpy(*rpy).T if any(rpy) else None), **known)
         self.events, self.throttle = deque[Event](), Throttle(clock)
 
     @property

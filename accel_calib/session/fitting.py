@@ -12,8 +12,7 @@ from .settings import CalibratorSettings
 from ..calibration import Calibration
 from ..effects import OwnEffect, shown_name
 from ..findings import (
-    calibration_json, outlook, rate, rate_refinement, Rating, refinement_json, rival_words,
-    verdict_words)
+    calibration_json, outlook, rate, Rating, refinement_json, rival_words, verdict_words)
 from ..geometry import angle_of, spread_directions
 from ..pipeline import calibrated, is_partial, is_refined, Plan
 from ..refinement import refine as refine_poses, Refinement
@@ -43,14 +42,6 @@ class Fitted:
     details: list[str]
     rating: Rating | None = None
     refinement: Refinement | None = None
-
-    @property
-    def refusal(self) -> tuple[str, ...]:
-        """Return why it must not be used, and what to do instead; empty if it can be used."""
-        if self.refinement is not None and self.refinement.refusal:
-            return self.refinement.refusal
-        rating = self.rating
-        return (rating.reason, rating.next.text) if rating and rating.name == 'BAD' else ()
 
 
 def fit(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
@@ -96,7 +87,8 @@ def refine(poses: Poses, units: Units, sensor: str, before: Calibration | None, 
             f'{beyond[0].effect} is {beyond[0].times_typical:.0f} times that of typical parts',
             f'find what else changed with it; {hint}' if hint else 'find what else changed with '
             'it: check the mounting and the setup, and take the poses again'))
-    rating, calibration = rate_refinement(refinement), refinement.calibration
+    calibration = refinement.calibration
+    rating = rate(calibration, refinement=refinement)
     details = [verdict_words(refinement).rstrip('.'), *(
         f'{shown_name(step.name)} {step.gap_before_mg:.3f} to {step.gap_after_mg:.3f} mg, '
         f'{step.where}' for step in refinement.steps)]

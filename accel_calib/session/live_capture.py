@@ -16,13 +16,12 @@ pose is marked as doubtful, and the fit leaves it out if possible.
 
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
-from operator import is_, is_not
+from operator import is_
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..finding import Finding
 from ..stillness import (
@@ -44,136 +43,6 @@ _SAME_MEAN = 4.0
 
 _BANDS = 5
 """Parts of the range of another column so far; poses in different parts are not merged."""
-
-
-class PoseBook:
-    """Poses as dwells in the order of their capture, of which the last are `held`: provisional."""
-
-    def __init__(self, settings: CaptureSettings, units: Units) -> None:
-        self._settings, self._units = settings, units
-        self._earlier: list[Dwell] = []
-        self._dwells: list[Dwell] = []
-        self.held: list[Dwell] = []
-        self._made: tuple[list[Dwell], Poses] | None = None
-
-    def poses(self) -> Poses:
-        """Return the pose table, with NaN where a pose lacks a column of the context."""
-        dwells, made = [*self._earlier, *self._dwells, *self.held], self._made
-        if made is None or len(made[0]) != len(dwells) or not all(map(is_, made[0], dwells)):
-            # Merging compares all pairs; the diagnostics ask every second.
-            made = self._made = dwells, poses_from(
-                self._selected(dwells), self._settings, partial=True)
-        return made[1]
-
-    def _selected(self, dwells: list[Dwell]) -> list[Dwell]:
-        """Keep, merge or refuse repeated poses, separately in each band of the context."""
-        dwells = with_temperature(dwells)
-        bands: dict[bytes, list[Dwell]] = {}
-        for dwell, band in zip(dwells, _bands(dwells), strict=True):
-            bands.setdefault(band.tobytes(), []).append(dwell)
-        return [dwell for band in bands.values()
-                for dwell in select(band, self._settings, self._units)]
-
-    def lacking(self, column: str) -> tuple[int, int]:
-        """Return how many dwells have no value in a column of the context, and how many have."""
-        known = [column in each.context for each in (*self._earlier, *self._dwells, *self.held)]
-        return known.count(False), known.count(True)
-
-    def add_stored(self, poses: Poses) -> None:
-        """Insert stored poses before the others."""
-        self._earlier[:0] = [_dwell_of(poses, k) for k in range(len(poses))]
-
-    def holds(self, dwell: Dwell) -> bool:
-        """Return whether this rest is a provisional pose."""
-        return any(overlap(dwell, each) for each in self.held)
-
-    def lacks(self, rest: Rest) -> bool:
-        """Return whether a rest is part of no pose, provisional or doubtful ones included."""
-        return not any(overlap(rest, each) for each in (*self.held, *self._dwells))
-
-    def put(self, dwell: Dwell, *, ended: bool) -> None:
-        """Add the pose of a rest, or replace its provisional one; provisional until it `ended`."""
-        self.held = [each for each in self.held if not overlap(dwell, each)]
-        if not any(_has_same_samples(each, dwell) for each in (*self._earlier, *self._dwells)):
-            (self._dwells if ended else self.held).append(dwell)
-        if len(self._dwells) > _SEPARATE:
-            self._earlier = self._selected([*self._earlier, self._dwells.pop(0)])
-
-    def doubt_held(self, is_over: Callable[[Dwell], bool]) -> int:
-        """Mark provisional poses without a final average as doubtful; return their number."""
-        over = [each for each in self.held if is_over(each)]
-        self.held = [each for each in self.held if not is_over(each)]
-        for dwell in over:
-            self.put(replace(dwell, doubtful=True), ended=True)
-        return len(over)
-
-    def mark(self, marked: Callable[[Dwell], Dwell]) -> int:
-        """Replace dwells by marked ones, or keep them; return the number of new ones."""
-        before, self._dwells = self._dwells, list(map(marked, self._dwells))
-        return sum(map(is_not, before, self._dwells))
-
-    def undo(self) -> bool:
-        """Remove the last pose; return whether there was one."""
-        entries = self.held or self._dwells or self._earlier
-        return bool(entries and entries.pop())
-
-    def clear(self) -> None:
-        """Remove all poses."""
-        self._earlier, self._dwells, self.held = [], [], []
-
-
-def _bands(dwells: list[Dwell]) -> NDArray[np.int64]:
-    """Return the (n, k) band of each dwell in each column of the context; unknown: -1."""
-    keys = sorted({key for dwell in dwells for key in dwell.context} - {'rate'})
-    found = np.full((len(dwells), len(keys)), -1, np.int64)
-    for k, key in enumerate(keys):
-        values = np.array([dwell.context.get(key, np.nan) for dwell in dwells], float)
-        known = np.isfinite(values)
-        least, width = np.min(values[known]), np.ptp(values[known]) / _BANDS
-        least, width = (0.0, _BAND) if key == 'temperature' else (least, width or 1.0)
-        found[known, k] = np.round((values[known] - least) / width)
-    return found
-
-
-def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
-    """Return dwells with missing temperatures set to that of the nearest one; tables need all."""
-    known = [dwell for dwell in dwells if 'temperature' in dwell.context]
-    found, times = [], np.array([dwell.time for dwell in known])
-    for dwell in dwells:
-        away = np.abs(times - dwell.time)
-        lacks = 'temperature' not in dwell.context
-        if lacks and np.min(away, initial=np.inf) <= _SAME_TEMPERATURE:
-            warm = known[int(np.argmin(away))].context['temperature']
-            found.append(replace(dwell, context={**dwell.context, 'temperature': warm}))
-        else:
-            found.append(dwell)
-    return found
-
-
-def overlap(one: Dwell | Rest, other: Dwell) -> bool:
-    """Return whether two dwells overlap in time; they are then the same rest."""
-    return one.start <= other.end and other.start <= one.end
-
-
-def _has_same_samples(one: Dwell, other: Dwell) -> bool:
-    """Return whether two dwells have the same stamps and mean: a recording is played again."""
-    noise = np.hypot(one.std / np.sqrt(one.count), other.std / np.sqrt(other.count))
-    return (overlap(one, other) and not one.doubtful
-            and bool(np.all(np.abs(one.mean - other.mean) <= _SAME_MEAN * noise)))
-
-
-def _dwell_of(poses: Poses, k: int) -> Dwell:
-    """Return a row of a table as a dwell, with an orientation of its own."""
-    time = float(poses['time'][k]) if 'time' in poses else 0.0
-    count = float(poses['count'][k]) if 'count' in poses else 1.0
-    std = poses['std'][k] if 'std' in poses else poses.reading[k] * 0.0
-    context = {key: poses[key][k] for key in (*CONTEXT, 'rate', *poses.quantities)
-               if key in poses and np.all(np.isfinite(poses[key][k]))}
-    doubtful, at_limit = (name in poses and bool(poses[name][k])
-                          for name in ('doubtful', 'at_limit'))
-    rate_std = poses['rate_std'][k] if 'rate_std' in poses else np.full(3, np.nan)
-    return Dwell(time, time, time, poses.reading[k], std, count, max(1, round(count)), context,
-                 -1 - k, doubtful, rate_std, at_limit=at_limit)
 
 
 LONG_REST = 300.0
@@ -211,13 +80,21 @@ class Change:
 
 
 class LiveCapture:
-    """The stillness detector and the poses of one sensor; `context` as of `StillDetector`."""
+    """
+    The stillness detector and the poses of one sensor; `context` as of `StillDetector`.
+
+    The poses are dwells in the order of their capture, of which the last are held: provisional.
+
+    """
 
     def __init__(self, settings: CaptureSettings, units: Units,
                  context: Sequence[str] = CONTEXT) -> None:
         self.detector = StillDetector(settings, units, context=context)
-        self.book, self._units = PoseBook(settings, units), units
-        self._settings, self._begun = settings, -math.inf
+        self._settings, self._units, self._begun = settings, units, -math.inf
+        self._earlier: list[Dwell] = []
+        self._dwells: list[Dwell] = []
+        self._held: list[Dwell] = []
+        self._made: tuple[list[Dwell], Poses] | None = None
         self._rest: Dwell | None = None
         self._declined: Dwell | None = None
         self._looked = self._was_still = 0.0
@@ -228,6 +105,115 @@ class LiveCapture:
         """Return whether the sensor is still."""
         # Until a rest is as long as a pose, the noise is not known, and may be a motion.
         return self.detector.still and self._rest is not None
+
+    # The poses
+
+    def poses(self) -> Poses:
+        """Return the pose table, with NaN where a pose lacks a column of the context."""
+        dwells, made = [*self._earlier, *self._dwells, *self._held], self._made
+        if made is None or len(made[0]) != len(dwells) or not all(map(is_, made[0], dwells)):
+            # Merging compares all pairs; the diagnostics ask every second.
+            made = self._made = dwells, poses_from(
+                self._select(dwells), self._settings, partial=True)
+        return made[1]
+
+    def _select(self, dwells: list[Dwell]) -> list[Dwell]:
+        """Keep, merge or refuse repeated poses, separately in each band of the context."""
+        dwells = with_temperature(dwells)
+        keys = sorted({key for dwell in dwells for key in dwell.context} - {'rate'})
+        numbers = np.full((len(dwells), len(keys)), -1, np.int64)  # of the bands; unknown: -1
+        for k, key in enumerate(keys):
+            values = np.array([dwell.context.get(key, np.nan) for dwell in dwells], float)
+            known = np.isfinite(values)
+            least, width = np.min(values[known]), np.ptp(values[known]) / _BANDS
+            least, width = (0.0, _BAND) if key == 'temperature' else (least, width or 1.0)
+            numbers[known, k] = np.round((values[known] - least) / width)
+        bands: dict[bytes, list[Dwell]] = {}
+        for dwell, band in zip(dwells, numbers, strict=True):
+            bands.setdefault(band.tobytes(), []).append(dwell)
+        return [dwell for band in bands.values()
+                for dwell in select(band, self._settings, self._units)]
+
+    def lacking(self, column: str) -> tuple[int, int]:
+        """Return how many dwells have no value in a column of the context, and how many have."""
+        known = [column in each.context for each in (*self._earlier, *self._dwells, *self._held)]
+        return known.count(False), known.count(True)
+
+    def add_stored(self, poses: Poses) -> None:
+        """Insert stored poses before the others, each with an orientation of its own."""
+        stored, unknown = [], np.full(3, np.nan)
+        for k in range(len(poses)):
+            row = {key: poses[key][k] for key in poses.columns}
+            time, count = float(row.get('time', 0.0)), float(row.get('count', 1.0))
+            stored.append(Dwell(
+                start=time, end=time, time=time, mean=row['reading'],
+                std=row.get('std', np.zeros(3)), count=count, samples=max(1, round(count)),
+                context={key: row[key] for key in (*CONTEXT, 'rate', *poses.quantities)
+                         if key in row and np.all(np.isfinite(row[key]))},
+                orientation=-1 - k, doubtful=bool(row.get('doubtful', False)),
+                rate_std=row.get('rate_std', unknown), at_limit=bool(row.get('at_limit', False))))
+        self._earlier[:0] = stored
+
+    def put(self, dwell: Dwell, *, ended: bool) -> None:
+        """Add the pose of a rest, or replace its provisional one; provisional until it `ended`."""
+        self._held = [each for each in self._held if not overlap(dwell, each)]
+        for each in (*self._earlier, *self._dwells):
+            noise = np.hypot(dwell.std / np.sqrt(dwell.count), each.std / np.sqrt(each.count))
+            if (overlap(each, dwell) and not each.doubtful
+                    and np.all(np.abs(each.mean - dwell.mean) <= _SAME_MEAN * noise)):
+                break  # the same stamps and mean: a recording is played again
+        else:
+            (self._dwells if ended else self._held).append(dwell)
+        if len(self._dwells) > _SEPARATE:
+            self._earlier = self._select([*self._earlier, self._dwells.pop(0)])
+
+    def _doubt(self, over: list[Dwell]) -> int:
+        """Mark poses that will get no final average as doubtful; return their number."""
+        for dwell in over:
+            self.put(replace(dwell, doubtful=True), ended=True)
+        return len(over)
+
+    def undo(self) -> bool:
+        """Remove the last pose and do not capture it again; return whether a pose was removed."""
+        self._declined = self._rest
+        entries = self._held or self._dwells or self._earlier
+        return bool(entries and entries.pop())
+
+    def clear(self) -> None:
+        """Remove all poses; the ongoing rest is not captured again."""
+        self._declined, self._begun = self._rest, self._looked
+        self._earlier, self._dwells, self._held = [], [], []
+
+    def capture(self, rest: Dwell) -> None:
+        """Capture the ongoing rest as a pose."""
+        self.put(rest, ended=False)
+        self._declined = None
+
+    def poses_for_fit(self, found: tuple[Finding, ...]) -> Poses:
+        """
+        Return the poses with findings about their samples: these, and those of the rests.
+
+        The provisional pose of the ongoing rest is updated. RefusedFitError if no sensor measures
+        so.
+
+        """
+        ongoing = self.detector.current() if self._held else None
+        if ongoing is not None and self._is_captured(ongoing, capture=False):
+            self.put(ongoing, ended=False)
+        check_measured(self.detector.lengths, self._units)
+        judged = self.detector.judged()
+        ends = {each.start: each.at_limit for each in judged}  # the later ones show it, too
+        self._dwells = [replace(each, at_limit=ends.get(each.start, each.at_limit))
+                        for each in self._dwells]
+        rests = [*(each.rest for each in judged), *self.detector.missing]
+        own = [each for each in rests if each.start >= self._begun]
+        poses = self.poses()
+        partial = [key for key in (*CONTEXT, *poses.quantities)
+                   if key in poses and np.isnan(poses[key]).any()]
+        return replace(poses.without_columns(*partial),
+                       findings=(*found, *account_of(own, self._settings)))
+
+    # Samples
 
     def push(self, samples: Floats, capture: bool) -> Iterator[Change]:
         """
@@ -242,7 +228,8 @@ class LiveCapture:
         for piece in pieces:
             ended, time = self.detector.push(piece), float(piece[-1, 0])
             change = self._end(ended, capture) if ended else self._look(time, capture)
-            refused = tuple(filter(self.book.lacks, self.detector.refused))
+            refused = tuple(rest for rest in self.detector.refused if not any(
+                overlap(rest, each) for each in (*self._held, *self._dwells)))
             if change is not None or refused:
                 yield replace(change or Change(), refused=refused)
 
@@ -251,50 +238,10 @@ class LiveCapture:
         ended = self.detector.close()
         return [self._end(ended, capture)] if ended else []
 
-    def poses(self, found: tuple[Finding, ...]) -> Poses:
-        """
-        Return the poses with findings about their samples: these, and those of the rests.
-
-        RefusedFitError if no sensor measures so.
-
-        """
-        check_measured(self.detector.lengths, self._units)
-        judged = self.detector.judged()
-        ends = {each.start: each.at_limit for each in judged}  # the later ones show it, too
-        self.book.mark(lambda each: replace(each, at_limit=ends.get(each.start, each.at_limit)))
-        rests = [*(each.rest for each in judged), *self.detector.missing]
-        own = [each for each in rests if each.start >= self._begun]
-        poses = self.book.poses()
-        partial = [key for key in (*CONTEXT, *poses.quantities)
-                   if key in poses and np.isnan(poses[key]).any()]
-        return replace(poses.without_columns(*partial),
-                       findings=(*found, *account_of(own, self._settings)))
-
-    def capture(self, rest: Dwell) -> None:
-        """Capture the ongoing rest as a pose."""
-        self.book.put(rest, ended=False)
-        self._declined = None
-
-    def refresh(self) -> None:
-        """Update the pose of the ongoing rest, if it is a provisional one."""
-        dwell = self.detector.current() if self.book.held else None
-        if dwell is not None and self.book.holds(dwell):
-            self.book.put(dwell, ended=False)
-
-    def undo(self) -> bool:
-        """Remove the last pose and do not capture it again; return whether a pose was removed."""
-        self._declined = self._rest
-        return self.book.undo()
-
-    def clear(self) -> None:
-        """Remove all poses; the ongoing rest is not captured again."""
-        self._declined, self._begun = self._rest, self._looked
-        self.book.clear()
-
     def _is_captured(self, dwell: Dwell, capture: bool) -> bool:
         """Return whether a rest is a pose: already provisional, or every rest becomes a pose."""
         declined = self._declined is not None and overlap(self._declined, dwell)
-        return self.book.holds(dwell) or (capture and not declined)
+        return any(overlap(dwell, each) for each in self._held) or (capture and not declined)
 
     def _look(self, time: float, capture: bool) -> Change | None:
         """Return the changes by the ongoing rest at this time, if it is due."""
@@ -305,7 +252,13 @@ class LiveCapture:
             return None
         self._looked = time
         if not still:
-            return self._doubt_held(time)
+            over, (windows, samples) = [], _SURELY_OVER
+            for held in self._held:
+                period = (held.end - held.start) / held.samples
+                away = max(windows * self._settings.still_window, samples * period)
+                if not held.start <= time <= max(held.end, self._was_still) + away:
+                    over.append(held)
+            return Change(poses=True, doubted=self._doubt(over)) if over else None
         dwell = self.detector.current()
         if dwell is None:
             return None
@@ -314,34 +267,44 @@ class LiveCapture:
             return None
         self._rest, captured = dwell, self._is_captured(dwell, capture)
         if captured:
-            self.book.put(dwell, ended=False)
+            self.put(dwell, ended=False)
         return Change(rest=dwell, poses=captured)
 
     def _end(self, ended: list[Dwell], capture: bool) -> Change:
         captured = [dwell for dwell in ended if self._is_captured(dwell, capture)]
         for dwell in captured:
-            self.book.put(dwell, ended=True)
+            self.put(dwell, ended=True)
         last, rest = ended[-1], self._rest
         latest = rest is None or rest.start <= last.end
         if latest:
             self._rest = last
         # Rests end in order: an older provisional pose will not get a final average.
-        doubted = self.book.doubt_held(lambda dwell: dwell.end < last.start)
+        doubted = self._doubt([each for each in self._held if each.end < last.start])
         threshold = self.detector.threshold
         if threshold <= _NOISE_FELL * self._judged_at:
             self._judged_at = threshold
             moved = {each.start for each in self.detector.judged() if each.reason}
-            doubted += self.book.mark(lambda each: replace(each, doubtful=True) if (
-                each.start in moved and not each.doubtful) else each)
+            for k, each in enumerate(self._dwells):
+                if each.start in moved and not each.doubtful:
+                    self._dwells[k], doubted = replace(each, doubtful=True), doubted + 1
         return Change(last if latest else None, tuple(ended), bool(captured or doubted), doubted)
 
-    def _doubt_held(self, time: float) -> Change | None:
-        """Mark provisional poses as doubtful that will not get a final average."""
-        def is_over(dwell: Dwell) -> bool:
-            windows, samples = _SURELY_OVER
-            period = (dwell.end - dwell.start) / dwell.samples
-            away = max(windows * self._settings.still_window, samples * period)
-            return not dwell.start <= time <= max(dwell.end, self._was_still) + away
 
-        count = self.book.doubt_held(is_over)
-        return Change(poses=True, doubted=count) if count else None
+def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
+    """Return dwells with missing temperatures set to that of the nearest one; tables need all."""
+    known = [dwell for dwell in dwells if 'temperature' in dwell.context]
+    found, times = [], np.array([dwell.time for dwell in known])
+    for dwell in dwells:
+        away = np.abs(times - dwell.time)
+        lacks = 'temperature' not in dwell.context
+        if lacks and np.min(away, initial=np.inf) <= _SAME_TEMPERATURE:
+            warm = known[int(np.argmin(away))].context['temperature']
+            found.append(replace(dwell, context={**dwell.context, 'temperature': warm}))
+        else:
+            found.append(dwell)
+    return found
+
+
+def overlap(one: Dwell | Rest, other: Dwell) -> bool:
+    """Return whether two dwells overlap in time; they are then the same rest."""
+    return one.start <= other.end and other.start <= one.end

@@ -16,7 +16,6 @@ request is not repeated.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import math
 
@@ -32,12 +31,6 @@ _FOLLOWED = math.cos(math.radians(30.0))
 
 _APART = math.cos(math.radians(50.0))
 """Requests 50° to 130° apart show two axes."""
-
-_WITHOUT_NEW = 30.0
-"""Time without a new pose after which the robot probably cannot be turned further [s]."""
-
-NOT_FOLLOWED = 3
-"""Number of requests in a row that are not followed, with the same meaning."""
 
 _ANSWERS = 4
 """Number of answers from which the axes are found."""
@@ -126,22 +119,10 @@ class Guide:
             planned = tuple(each for each in planned if not np.any(new @ each.up >= TAKEN))
         return replace(self, chosen=plan, planned=planned, is_stale=False)
 
-    def follow(self, planned: Sequence[PlannedPose]) -> Guide:
-        """Ask for these poses of a refinement next; for none, ask for poses for a fit."""
-        return replace(self, planned=tuple(planned) or None, begun=self.poses)
-
     @property
     def poses(self) -> int:
         """Return the number of poses for which the next pose was chosen."""
         return 0 if self.chosen is None else self.chosen.poses
-
-    def note(self, count: int, stamp: float) -> Guide:
-        """Note the number of poses at a header stamp [s]."""
-        return self if count == self.count else replace(self, count=count, new_at=stamp)
-
-    def is_stuck(self, stamp: float) -> bool:
-        """Return whether several requests were not followed, or no pose is new for a time."""
-        return self.missed >= NOT_FOLLOWED or stamp - self.new_at >= _WITHOUT_NEW
 
     def answer(self, mean: Floats, units: Units) -> tuple[Guide, str]:
         """Note the mean reading of a new rest; return also how it is not what was asked for."""
@@ -157,23 +138,18 @@ class Guide:
         skips = all(each @ wanted < TAKEN for each in self.skipped)
         noted = replace(noted, skipped=(*self.skipped, *([wanted] if skips else [])),
                         missed=self.missed + 1, is_stale=True)
-        axes = noted._likely_axes(plan.up)
+        asked_all, read_all = map(np.array, zip(*noted.answers, strict=True))
+        # Opposite requests show one axis alone, and a robot that tilts reads the same without end.
+        telling = np.min(np.abs(asked_all @ asked_all.T)) < _APART and not lies_in_cone(
+            np.vstack([plan.up, read_all]))
+        wrong, axes = int(np.sum(np.sum(read_all * asked_all, axis=1) < _FOLLOWED)), _AXES[0]
+        if telling and wrong >= _FEWEST_WRONG:
+            likely = _AXES if len(asked_all) > _FEWEST_WRONG else _AXES[:_SIMPLE]
+            axes = next((each for each in likely if np.all(
+                np.sum(read_all * (asked_all @ each.T), axis=1) >= _AGREES)), axes)
         if not np.array_equal(axes, self.axes):
             noted = replace(noted, axes=axes, skipped=(), missed=0)
         return noted, f'asked for {_signs(asked)}, the sensor reads {_signs(read)}'
-
-    def _likely_axes(self, up: Floats) -> Floats:
-        """Return the axes in which the last answers follow; `up` are the poses, (n, 3)."""
-        asked, read = map(np.array, zip(*self.answers, strict=True))
-        # Opposite requests show one axis alone, and a robot that tilts reads the same without end.
-        telling = np.min(np.abs(asked @ asked.T)) < _APART and not lies_in_cone(
-            np.vstack([up, read]))
-        if telling and np.sum(np.sum(read * asked, axis=1) < _FOLLOWED) >= _FEWEST_WRONG:
-            likely = _AXES if len(asked) > _FEWEST_WRONG else _AXES[:_SIMPLE]
-            for axes in likely:
-                if np.all(np.sum(read * (asked @ axes.T), axis=1) >= _AGREES):
-                    return axes
-        return _AXES[0]
 
     @property
     def axes_words(self) -> str:

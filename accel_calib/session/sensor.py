@@ -141,7 +141,7 @@ class Sensor:
             and not np.array_equal(before.model.rotation, calibration.model.rotation))
         if not only_levelled:
             past, counted = None if calibration is None else Drift(calibration), self.rest
-        self.temperatures.forget()
+        self.temperatures.followed.clear()  # but for models that are asked for from now on
         return replace(self.offer(None, settings), calibration=calibration, unsaved=False,
                        drift=past, past=past, counted=counted).turn(settings)
 
@@ -183,24 +183,26 @@ class Sensor:
         """Whether the sensor has changed since the calibration."""
         return self.drift is not None and self.drift.change is not None
 
-    def update(self, rest: Dwell, least: float) -> Sensor:
-        """Compare an ongoing rest with 1 g; `least` is the smallest change to report [g]."""
+    def update(self, rest: Dwell, least: float, *, ended: bool = False) -> Sensor:
+        """
+        Compare a rest with 1 g: the ongoing one, or one that has `ended`.
+
+        `least` is the smallest change to report [g].
+
+        """
         past, counted, part = self.past, self.counted, self._uncounted(rest)
-        if part is not None and part.end - part.start >= LONG_REST:  # a slow change is no noise
+        if ended:
+            past, counted = self._with(rest, least), rest
+        elif part is not None and part.end - part.start >= LONG_REST:  # a slow change is no noise
             past, counted = self._with(rest, least), replace(
                 rest, std=part.std, count=part.count / part.samples * rest.samples)
-        return replace(self, rest=rest, past=past, counted=counted)._compare(least)
-
-    def end(self, rest: Dwell, least: float) -> Sensor:
-        """Compare a rest that ended with 1 g; `least` is as in `update`."""
-        return replace(self, past=self._with(rest, least), counted=rest)._compare(least)
-
-    def _compare(self, least: float) -> Sensor:
-        found, past = self.past if self.rest is None else self._with(self.rest, least), self.past
+        latest = self.rest if ended else rest
+        found = past if latest is None else replace(
+            self, past=past, counted=counted)._with(latest, least)
         if found is not None and past is not None and found.change and not past.change:
             # What was reported during a rest ends by the rule of `drift`, not with the rest.
             past = replace(past, change=found.change, since=found.since)
-        return replace(self, drift=found, past=past)
+        return replace(self, rest=latest, drift=found, past=past, counted=counted)
 
     def _uncounted(self, rest: Dwell) -> Dwell | None:
         """Return the part of a rest that was not counted yet, or None if it is too short."""
@@ -262,23 +264,16 @@ class Sensor:
 
     def force_of(self, reading: Triple, known: Known) -> Triple | None:
         """Return the force of a reading by the `present` calibration [g]; None: not known."""
-        calibration, corrected = self.present, self._corrected
-        if calibration is None or corrected is None:
-            return None
-        context = {**calibration.model.neutral, 'std': _AT_REST, 'previous': _AT_REST,
-                   'rate': _AT_REST, **self.temperatures.columns_of(calibration.model), **known}
-        try:
-            return corrected.at(context).correct(*reading)
-        except InputError:
-            return None  # a quantity is not known yet, or the reading is out of range
-
-    @cached_property
-    def _corrected(self) -> OneReading | None:
-        """Return what corrects one reading by the `present` calibration."""
         calibration = self.present
         if calibration is None:
             return None
-        return OneReading(calibration, 1.0 / calibration.force_per_g)
+        context = {**calibration.model.neutral, 'std': _AT_REST, 'previous': _AT_REST,
+                   'rate': _AT_REST, **self.temperatures.columns_of(calibration.model), **known}
+        prepared = OneReading(calibration, 1.0 / calibration.force_per_g)
+        try:
+            return prepared.at(context).correct(*reading)
+        except InputError:
+            return None  # a quantity is not known yet, or the reading is out of range
 
 
 def new_sensor(settings: CalibratorSettings, units: Units) -> Sensor:
@@ -295,8 +290,8 @@ def gyro_bias_of_rest(rest: Dwell) -> GyroBias | None:
         return None
     temperature = float(np.asarray(rest.context.get('temperature', math.nan)))
     known = () if math.isnan(temperature) else (temperature, temperature)
-    return GyroBias(np.asarray(rate, float), rest.rate_std / math.sqrt(rest.count), 1,
-                    temperature, np.zeros(3), known)
+    return GyroBias(np.asarray(rate, float), rest.rate_std / math.sqrt(rest.count), rests=1,
+                    temperature=temperature, slope=np.zeros(3), temperatures=known)
 
 
 def rest_after(part: Dwell, whole: Dwell) -> Dwell:

@@ -21,18 +21,19 @@ import numpy as np
 
 from .commands import fit_if_due, poses_changed
 from .conditions import APART, CONCERNS, conditions, next_step, slow_turn, thermometer_words
-from .core import begin, Holder
+from .core import Holder
 from .live_capture import Change
 from .sensor import new_sensor
-from .settings import CalibratorSettings, context_topics
-from .store import Identity, SensorFiles, store_of
+from .settings import CalibratorSettings
+from .store import SensorFiles, store_of
 from .stream import AGAIN, SILENT
 from .use import adopt, open_files, show_mounting, show_poses
 from .worker import answered, ShowPoses, Still, Task
 from ..comparison import status
 from ..findings import mounting_words
+from ..logs import named_topics
 from ..table import Floats
-from ..text import counted, LONGEST_NAME, one_line
+from ..text import counted
 
 BATCH = 0.3
 """
@@ -72,12 +73,12 @@ class Session(Holder):
 
     def __init__(self, settings: CalibratorSettings, topic: str,
                  clock: Callable[[], float] = monotonic, **known: Any) -> None:
-        super().__init__(replace(begin(settings, topic, clock), **known), clock)
+        super().__init__(settings, topic, clock, **known)
         self._told: list[tuple[str, str]] = []  # kinds and subjects of the logged findings
         units = self.state.units
         self._largest = _LARGEST_NATIVE if units.is_native else _LARGEST_G * units.per_g
         is_named = settings.sensor or settings.calibration_file
-        if not is_named or not self._open(answered):
+        if not is_named or not self._begin(answered):
             show_poses(self, store=False)
 
     def set_settings(self, settings: CalibratorSettings) -> None:
@@ -98,12 +99,11 @@ class Session(Holder):
             if self.state.files.lock is not None:
                 self.events.append(open_files(self, files.store, self.sensor))
         self._report_still()
-        self._report_findings()
-        self._report_context()
+        self._report_conditions()
         fit_if_due(self)
 
-    def _report_findings(self) -> None:
-        """Log what is wrong, and what is over."""
+    def _report_conditions(self) -> None:
+        """Log what is wrong, what is over, and what a pose or an effect would need."""
         state, statistics = self.state, self.state.statistics
         now = {(each.kind, each.about): each.text for each in conditions(state)
                if each.level != 'GOOD' and each.kind not in APART}
@@ -120,18 +120,15 @@ class Session(Holder):
         if over and statistics.rate and all(kind in CONCERNS for kind, _ in now):
             self.log('info', f'messages arrive as expected, {statistics.rate:.1f} Hz')
         self._told = list(now)
-
-    def _report_context(self) -> None:
-        """Log what would be needed for a pose, or for the effects of a quantity."""
-        state, topics = self.state, context_topics(self.state.settings)
+        topics = named_topics(state.settings.context)
         if (turn := slow_turn(state)) and state.settings.auto_capture:
             self.log('info', f'no pose yet: {turn}', 'slow_turn', AGAIN)
-        if (state.surroundings.thermometers and state.statistics.messages
+        if (state.surroundings.thermometers and statistics.messages
                 and 'temperature' not in topics and math.isnan(state.around.temperature)):
             self.log('warning', f'no temperature arrives; {thermometer_words(state)}',
                      'thermometers', 10.0 * _FAULT_AGAIN)
         for column in topics:
-            lack, have = state.sensor.live.book.lacking(column)
+            lack, have = state.sensor.live.lacking(column)
             if lack and have:
                 self.log('info', f'{lack} of {counted(lack + have, "pose")} have no {column}, '
                          'so that ~/refine cannot use it', f'poses without {column}',
@@ -158,7 +155,7 @@ class Session(Holder):
             self.change(frame_id=frame_id)
             self._show_frame()
             if self.state.files.store is None or self.sensor.owners - {self.state.name}:
-                self._begin_again()
+                self._begin(self.events.append)
             elif not self.state.settings.sensor:
                 self._find_store()
             return True
@@ -170,7 +167,7 @@ class Session(Holder):
         if is_replaced:
             self.change(frame_id=frame_id)
             if not self.state.settings.sensor:  # otherwise the user has set the sensor
-                self._begin_again()
+                self._begin(self.events.append)
             self._show_frame()
             return True
         self.drop('foreign', 'error', f'an Imu message has frame_id {frame_id!r}, expected '
@@ -219,7 +216,7 @@ class Session(Holder):
             if change.rest is not None:
                 sensor = sensor.update(change.rest, least)
             for dwell in change.ended:
-                sensor = sensor.end(dwell, least)
+                sensor = sensor.update(dwell, least, ended=True)
             self.change(sensor=sensor)
             if sensor.drift is not None and sensor.has_changed is not had_changed:
                 self.log('warning' if sensor.has_changed else 'info', status(sensor.drift))
@@ -261,13 +258,14 @@ class Session(Holder):
         if plan is not None:
             self.events.append(ShowPoses(plan.up, plan.asked, frame_id or ''))
 
-    def _begin_again(self) -> None:
-        """Discard poses and calibration of another sensor, and load those of this sensor."""
-        self.change(sensor=new_sensor(self.state.settings, self.state.units))
-        self._open(self.events.append)
+    def _begin(self, run: Callable[[Task], object]) -> bool:
+        """
+        Begin with a new sensor: lock its files, and let `run` load them.
 
-    def _open(self, run: Callable[[Task], object]) -> bool:
-        """Lock and load the files of the sensor; return whether no other node uses them."""
+        Returns whether no other node uses them.
+
+        """
+        self.change(sensor=new_sensor(self.state.settings, self.state.units))
         self._find_store()
         files = self.state.files
         self.change(problem=files.problem)
@@ -279,10 +277,7 @@ class Session(Holder):
     def _find_store(self) -> None:
         """Go on with the files of the sensor, locked unless another node uses them."""
         state, before = self.state, self.state.files
-        settings = state.settings
-        identity = Identity(one_line(state.name).strip()[:LONGEST_NAME], state.topic,
-                            bool(settings.sensor))
-        store = store_of(settings.calibration_file, identity, settings.units, state.own)
+        store = store_of(state.settings, state.name, state.topic, state.own)
         files = replace(before, store=store)
         if before.path != files.path:
             before.release()

@@ -18,10 +18,9 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, Field, field, fields, MISSING, replace
 import math
-from pathlib import Path
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from ..effects import effects_of_file, MODELS, OwnEffect
+from ..effects import MODELS
 from ..errors import InputError
 from ..logs import named_topics
 from ..stillness import CaptureSettings, REPEATED, Repeated, settings_from
@@ -89,32 +88,33 @@ def expected(given: Field[Any]) -> str:
     return kind if limits is None else f'{kind} from {limits[0]:.10g} to {limits[1]:.10g}'
 
 
-def checked(given: Field[Any], value: Any) -> Any:
-    """Return a value converted to the type of a parameter; InputError if it is not accepted."""
-    default, found = default_of(given), None
-    choices, limits = given.metadata['choices'], given.metadata['limits']
-    kind = type(default)
-    if kind is list:
-        with suppress(TypeError, ValueError):  # rclpy passes arrays and bytes
-            items = [type(default[0])(item) for item in value]
-            if not isinstance(default[0], float) or len(items) == len(default):
-                found = items
-    elif bool in (kind, type(value)):
-        found = value if type(value) is kind else None
-    elif isinstance(value, _ACCEPTED[kind]):
-        found = kind(value)
-    if (found is None or (choices and found not in choices)
-            or (limits is not None and not limits[0] <= found <= limits[1])):
-        raise InputError(f'parameter {given.name} is {value!r}, expected {expected(given)}',
-                         'correct the value')
-    return found
-
-
 def changed(settings: Settings, values: Mapping[str, Any]) -> Settings:
-    """Return the settings with these parameters `checked` and changed; ignore other names."""
-    known = {each.name: each for each in fields(settings)}
-    given = {name: checked(known[name], value) for name, value in values.items() if name in known}
-    return replace(settings, **given)
+    """
+    Return the settings with these parameters converted to their types; ignore other names.
+
+    InputError if a parameter does not accept its value.
+
+    """
+    known, accepted = {each.name: each for each in fields(settings)}, {}
+    for name in filter(known.__contains__, values):
+        value, default, found = values[name], default_of(known[name]), None
+        choices, limits = known[name].metadata['choices'], known[name].metadata['limits']
+        kind = type(default)
+        if kind is list:
+            with suppress(TypeError, ValueError):  # rclpy passes arrays and bytes
+                items = [type(default[0])(item) for item in value]
+                if not isinstance(default[0], float) or len(items) == len(default):
+                    found = items
+        elif bool in (kind, type(value)):
+            found = value if type(value) is kind else None
+        elif isinstance(value, _ACCEPTED[kind]):
+            found = kind(value)
+        if (found is None or (choices and found not in choices)
+                or (limits is not None and not limits[0] <= found <= limits[1])):
+            raise InputError(f'parameter {name} is {value!r}, expected {expected(known[name])}',
+                             'correct the value')
+        accepted[name] = found
+    return replace(settings, **accepted)
 
 
 _MODELS = tuple(name for name in MODEL_NAMES
@@ -220,23 +220,9 @@ class CalibratorSettings:
         'without encryption')
 
 
-def own_effects(settings: CalibratorSettings) -> tuple[OwnEffect, ...]:
-    """Return the effects of the file `also`; InputError if it is bad."""
-    try:
-        return effects_of_file(Path(settings.also).expanduser()) if settings.also else ()
-    except (OSError, RuntimeError) as error:
-        raise InputError(f'also is {settings.also}, which cannot be read: {error}',
-                         'correct the parameter') from error
-
-
-def context_topics(settings: CalibratorSettings) -> dict[str, str]:
-    """Return the topic of each column of `context`, as `logs.named_topics`."""
-    return named_topics(settings.context)
-
-
 def columns_of(settings: CalibratorSettings) -> tuple[str, ...]:
     """Return the columns of the context of a sample."""
-    return tuple(dict.fromkeys((*CONTEXT, *context_topics(settings))))
+    return tuple(dict.fromkeys((*CONTEXT, *named_topics(settings.context))))
 
 
 def capture_settings(settings: CalibratorSettings) -> CaptureSettings:

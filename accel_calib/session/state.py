@@ -21,11 +21,11 @@ import numpy as np
 from .conditions import CONCERNS, conditions, next_step, thermometer_words
 from .core import State
 from .sensor import title
-from .settings import context_topics
 from .stream import SILENT
 from ..comparison import status
 from ..errors import InputError
 from ..finding import has, Level, LEVELS
+from ..logs import named_topics
 from ..messages.one_reading import Triple
 from ..pipeline import is_partial
 from ..table import column_of
@@ -131,9 +131,22 @@ class Progress:
 def progress(state: State, reading: Triple | None = None) -> Progress:
     """Return the progress; `reading` is the newest one, by default the last that was pushed."""
     sensor, statistics = state.sensor, state.statistics
-    plan, silent = sensor.guide.plan, statistics.age > SILENT
-    up, length, corrected = ((), math.nan, math.nan) if silent else _newest(state, reading)
+    plan, silent, native = sensor.guide.plan, statistics.age > SILENT, state.units.is_native
     step, rating = next_step(state), sensor.rating
+    if reading is None and statistics.newest is not None:
+        reading = tuple(statistics.newest.tolist())
+    up: tuple[float, ...] = ()
+    length = corrected = math.nan
+    if reading is not None and not silent:
+        along, force = np.array(reading), sensor.force_of(reading, state.context)
+        corrected = math.nan if force is None else math.hypot(*force)
+        if native and sensor.present is not None and force is not None:
+            along = sensor.present.rotation @ force
+        elif native:  # the direction is known only with the zero
+            along = along - plan.zero if plan is not None and plan.zero else along * math.nan
+        size = math.hypot(*along)
+        up = tuple((along / size).tolist()) if 0.0 < size < math.inf else ()
+        length = math.nan if native else size / state.units.per_g
     # NaN if it is not known, or not the noise alone.
     noisy = rating is not None and has(rating.findings, 'beyond_noise')
     return Progress(
@@ -148,27 +161,6 @@ def progress(state: State, reading: Triple | None = None) -> Progress:
         up=up, length=length, corrected=corrected, temperature=state.around.temperature)
 
 
-def _newest(state: State, reading: Triple | None) -> tuple[tuple[float, ...], float, float]:
-    """Return direction (empty: not known), |a| and corrected |a| [g] of the newest reading."""
-    sensor, newest, native = state.sensor, state.statistics.newest, state.units.is_native
-    if reading is None and newest is not None:
-        reading = tuple(newest.tolist())
-    if reading is None:
-        return (), math.nan, math.nan
-    x, y, z = reading
-    force = sensor.force_of((x, y, z), state.context)
-    corrected = math.nan if force is None else math.hypot(*force)
-    along: list[float] = [x, y, z]
-    if native and sensor.present is not None and force is not None:
-        along = (sensor.present.rotation @ force).tolist()
-    elif native:  # the direction is known only with the zero
-        zero = () if sensor.guide.plan is None else sensor.guide.plan.zero
-        along = [part - at for part, at in zip(along, zero, strict=False)]
-    size = math.hypot(*along)
-    up = tuple(part / size for part in along) if 0.0 < size < math.inf else ()
-    return up, math.nan if native else size / state.units.per_g, corrected
-
-
 class Check(NamedTuple):
     """The result of a check: what is right or wrong, and its level as of a finding."""
 
@@ -178,25 +170,14 @@ class Check(NamedTuple):
 
 
 def diagnostics(state: State) -> list[Check]:
-    """Return the state, which is the first of the most severe findings, and all `checks`."""
-    found = conditions(state)
-    worst = max(found, key=lambda each: LEVELS.index(each.level))
-    checked = checks(state)
-    concern = CONCERNS.get(worst.kind, 'stream')
-    words = words_of_state(state) if worst.level == 'GOOD' else next(
-        each.words for each in checked if each.concern == concern)
-    return [Check('state', words, worst.level), *checked]
-
-
-def checks(state: State) -> list[Check]:
-    """Return for each concern what is wrong, or that all is fine."""
+    """Return first the state, with the most severe finding, and then a check for each concern."""
     sensor, drift, found, all_found = state.sensor, state.sensor.drift, [], conditions(state)
     fine = {'stream': f'{state.statistics.rate:.1f} Hz on {state.topic}',
             'calibration': '' if sensor.calibration is None else title(sensor.calibration),
             'drift': 'no calibration yet' if drift is None else status(drift),
             'storage': state.files.path}
     if sensor.calibration is None and sensor.offered is None:
-        count = counted(len(sensor.live.book.poses()), 'pose')
+        count = counted(len(sensor.live.poses()), 'pose')
         fine['calibration'] = f'no calibration yet, captured {count}'
     for concern, words in fine.items():
         wrong = [each for each in all_found if each.level != 'GOOD'
@@ -206,7 +187,11 @@ def checks(state: State) -> list[Check]:
             said[:1] = [': '.join(filter(None, [words, *said[:1]]))]
         level = max((each.level for each in wrong), key=LEVELS.index, default=LEVELS[0])
         found.append(Check(concern, '; '.join(said), level))
-    return found
+    worst = max(all_found, key=lambda each: LEVELS.index(each.level))
+    concern = CONCERNS.get(worst.kind, 'stream')
+    words = words_of_state(state) if worst.level == 'GOOD' else next(
+        each.words for each in found if each.concern == concern)
+    return [Check('state', words, worst.level), *found]
 
 
 def words_of_state(state: State) -> str:
@@ -227,7 +212,7 @@ def words_of_state(state: State) -> str:
 def figures(state: State) -> Iterator[tuple[str, str]]:
     """Yield names and values for the diagnostics."""
     sensor, counts, warm = state.sensor, state.statistics, state.around.temperature
-    gravity, rest, drift = sensor.gravity, sensor.rest, sensor.drift
+    gravity, rest, drift, live = sensor.gravity, sensor.rest, sensor.drift, sensor.live
     yield 'state', words_of_state(state)
     yield 'sensor', state.name
     yield 'calibration', 'none' if sensor.calibration is None else title(sensor.calibration)
@@ -250,22 +235,8 @@ def figures(state: State) -> Iterator[tuple[str, str]]:
             low, high = drift.temperatures
             yield 'temperature when calibrated [°C]', f'{low:.1f} to {high:.1f}'
     yield 'since last rest [s]', _number(math.nan if rest is None else (
-        0.0 if sensor.live.still else max(0.0, counts.stamp - rest.end)))
-    yield from _figures_of_capture(state)
-    yield 'mounting', state.mounting_words(sensor.calibration) or 'not known'
-    gyro, noise = sensor.gyro, sensor.noise
-    if gyro is not None:
-        yield 'gyro bias [rad/s]', _vector(gyro.at(warm))
-        yield 'gyro bias, standard deviation [rad/s]', _vector(gyro.sd)
-    if noise is not None:
-        yield 'noise of acceleration [m/s² or native]', _vector(noise.force)
-        yield 'noise of angular velocity [rad/s]', _vector(noise.rate)
-
-
-def _figures_of_capture(state: State) -> Iterator[tuple[str, str]]:
-    """Yield the figures of the poses, of the clock, and of what is known beside the messages."""
-    live, warm = state.sensor.live, state.around.temperature
-    poses, breaks = live.book.poses(), live.detector.interruptions
+        0.0 if live.still else max(0.0, counts.stamp - rest.end)))
+    poses, breaks = live.poses(), live.detector.interruptions
     yield 'poses captured', str(len(poses))
     yield 'poses doubtful', str(int(np.sum(poses['doubtful'])) if 'doubtful' in poses else 0)
     yield 'next', next_step(state).text or 'turn the sensor'
@@ -276,12 +247,20 @@ def _figures_of_capture(state: State) -> Iterator[tuple[str, str]]:
         f'{sum(each.end - each.start for each in live.detector.missing):.1f}')
     yield 'temperature [°C]', (_number(warm) if math.isfinite(warm)
                                else f'not known: {thermometer_words(state)}')
-    for column in context_topics(state.settings):
+    for column in named_topics(state.settings.context):
         unit = column_of(column).unit
         if column != 'temperature':
             yield f'{column} [{unit}]' if unit else column, _number(
                 state.around.values.get(column, math.nan))
     yield 'still below [m/s² or native]', f'{live.detector.threshold:.4g}'
+    yield 'mounting', state.mounting_words(sensor.calibration) or 'not known'
+    gyro, noise = sensor.gyro, sensor.noise
+    if gyro is not None:
+        yield 'gyro bias [rad/s]', _vector(gyro.at(warm))
+        yield 'gyro bias, standard deviation [rad/s]', _vector(gyro.sd)
+    if noise is not None:
+        yield 'noise of acceleration [m/s² or native]', _vector(noise.force)
+        yield 'noise of angular velocity [rad/s]', _vector(noise.rate)
 
 
 def _vector(values: Iterable[float]) -> str:

@@ -4,7 +4,7 @@
 """
 The files of a sensor: calibration and poses, and the lock for one node at a time.
 
-Each sensor has its own files (`Identity`). Stored data are never lost: files that cannot be used,
+Each sensor has its own files (`store_of`). Stored data are never lost: files that cannot be used,
 or that belong to another sensor, are renamed and never overwritten. So are folders with such a
 name, pipes, sockets and links to nothing. Devices, and folders without a suffix in their name, are
 left where they are: the node then works without storing.
@@ -31,6 +31,7 @@ import stat
 
 import numpy as np
 
+from .settings import CalibratorSettings
 from ..calibration import Calibration, check_sensor
 from ..disk import check_regular, copy_atomically, remove_leftovers, write_atomically
 from ..effects import OwnEffect
@@ -40,6 +41,7 @@ from ..errors import (
 from ..logs import read_poses, write_table
 from ..stored import calibration_bytes, read_calibration
 from ..table import LARGEST, Poses
+from ..text import LONGEST_NAME, one_line
 from ..units import UnitName
 
 _UNSAFE = re.compile(r'[^A-Za-z0-9_-]+')
@@ -59,23 +61,6 @@ _UNREADABLE = (errno.EACCES, errno.EPERM, errno.ENOENT, errno.ELOOP)
 
 _LARGEST_TABLE = 32 * 2**20
 """Largest pose table of a store: 100,000 poses have half of it [bytes]."""
-
-
-@dataclass(frozen=True)
-class Identity:
-    """A sensor: frame_id and topic, with namespace, of its messages; or `named` by the user."""
-
-    sensor: str
-    topic: str
-    named: bool = False
-
-    @property
-    def file_name(self) -> str:
-        """Name of the calibration file; it differs between sensors."""
-        if self.named:
-            return f'{_safe(self.sensor, _UNSAFE_NAMED)}.yaml'
-        topic = '.'.join(_safe(part) for part in self.topic.strip('/').split('/'))
-        return f'{topic}@{_safe(self.sensor)}.yaml'
 
 
 def _safe(name: str, unsafe: re.Pattern[str] = _UNSAFE) -> str:
@@ -102,7 +87,8 @@ class Store:
     """
 
     calibration: Path
-    identity: Identity
+    sensor: str
+    topic: str
     units: UnitName
     own: tuple[OwnEffect, ...] = ()
 
@@ -124,7 +110,7 @@ class Store:
 
         """
         calibration = read_calibration(path, self.own)
-        check_sensor(calibration, self.identity.sensor)
+        check_sensor(calibration, self.sensor)
         try:
             return calibration.in_units(self.units)
         except InputError as err:
@@ -153,7 +139,7 @@ class Store:
             row = int(np.argmin(poses['count'])) + 1
             raise InputError(f'{self.poses}: row {row} has an impossible count, expected at least '
                              f'{1.0 / LARGEST:g}', 'new poses start a new table')
-        for what, found, expected in (('sensor', poses.sensor, self.identity.sensor),
+        for what, found, expected in (('sensor', poses.sensor, self.sensor),
                                       ('units', poses.units, self.units)):
             if found and found != expected and expected:
                 raise StoredCalibrationError(f'{self.poses} has {what} {found!r}, expected '
@@ -162,7 +148,7 @@ class Store:
 
     def prepared(self, calibration: Calibration) -> tuple[bytes, bool]:
         """Return the content of the file of a calibration, and whether the present `is_good`."""
-        named = replace(calibration, sensor=self.identity.sensor, stream=self.identity.topic)
+        named = replace(calibration, sensor=self.sensor, stream=self.topic)
         return calibration_bytes(named), self.is_good()
 
     def is_good(self) -> bool:
@@ -256,7 +242,7 @@ class Store:
             self.poses.unlink(missing_ok=True)
             return
         self.poses.parent.mkdir(parents=True, exist_ok=True)
-        write_table(self.poses, replace(poses, sensor=self.identity.sensor, units=self.units))
+        write_table(self.poses, replace(poses, sensor=self.sensor, units=self.units))
 
     def set_aside(self, is_good: bool) -> list[Path]:
         """Rename both files, and return the new paths."""
@@ -282,17 +268,25 @@ def _exists(path: Path) -> bool:
     return True
 
 
-def store_of(calibration_file: str, identity: Identity, units: UnitName,
+def store_of(settings: CalibratorSettings, name: str, topic: str,
              own: tuple[OwnEffect, ...] = ()) -> Store:
-    """Return the store at `calibration_file`, by default in `ros_home`; InputError: no home."""
-    if calibration_file:
+    """
+    Return the store of a sensor, by default in `ros_home`; InputError if there is no home.
+
+    The name of the file has that of the sensor if the user has set it, otherwise also the topic.
+
+    """
+    sensor, units = one_line(name).strip()[:LONGEST_NAME], settings.units
+    if settings.calibration_file:
         try:
-            path = Path(calibration_file).expanduser()
+            path = Path(settings.calibration_file).expanduser()
         except RuntimeError as error:
-            raise InputError(f'calibration_file is {calibration_file}, but this user has no home '
-                             'folder', 'state the whole path') from error
-        return Store(path.absolute(), identity, units, own)
-    return Store(ros_home() / 'accel_calib' / identity.file_name, identity, units, own)
+            raise InputError(f'calibration_file is {settings.calibration_file}, but this user has '
+                             'no home folder', 'state the whole path') from error
+        return Store(path.absolute(), sensor, topic, units, own)
+    file_name = _safe(sensor, _UNSAFE_NAMED) if settings.sensor else (
+        f'{".".join(map(_safe, topic.strip("/").split("/")))}@{_safe(sensor)}')
+    return Store(ros_home() / 'accel_calib' / f'{file_name}.yaml', sensor, topic, units, own)
 
 
 def aside(path: Path, word: str) -> Path:
@@ -326,49 +320,13 @@ _TO_LOCK = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 """A link is not followed, because the lock would empty its target; a pipe does not block."""
 
 
-class StoreInUseError(AccelCalibError):
-    """Another node uses the files."""
-
-
-def lock(store: Store) -> ExitStack:
-    """
-    Lock the files of a store until the result is closed.
-
-    StoreInUseError if another process has locked them.
-
-    """
-    path = store.calibration.with_name(f'{store.calibration.stem}.lock')
-    with ExitStack() as held:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            handle = os.open(path, _TO_LOCK, 0o644)
-        except OSError:
-            return held  # the folder cannot be written, so there is nothing to protect
-        held.callback(os.close, handle)
-        if not stat.S_ISREG(os.fstat(handle).st_mode):
-            return held
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = os.read(handle, 32).decode(errors='replace').strip()
-            raise StoreInUseError(
-                f'{store.calibration} is used by the node with process id {holder or "unknown"}',
-                'stop that node, or restart this node with another calibration_file or sensor'
-            ) from None
-        except OSError:
-            return held  # this file system has no locks
-        with suppress(OSError):  # without space on the disk, the lock does not name its holder
-            os.ftruncate(handle, 0)
-            os.pwrite(handle, f'{os.getpid()}\n'.encode(), 0)
-        return held.pop_all()
-
-
 @dataclass(frozen=True)
 class SensorFiles:
     """
     The store of a sensor, None until the sensor is known, and its `lock`, None without it.
 
-    `problem` is why another node has the lock; empty if none has it.
+    `problem` is why another node has the lock; empty if none has it. Where files cannot be locked,
+    the lock is empty.
 
     """
 
@@ -382,13 +340,32 @@ class SensorFiles:
         return '' if self.store is None else str(self.store.calibration)
 
     def take(self) -> SensorFiles:
-        """Return the files, locked unless another node uses them."""
+        """Return the files, locked until `release` unless another process has locked them."""
         if self.store is None or self.lock is not None:
             return self
-        try:
-            return replace(self, lock=lock(self.store), problem='')
-        except StoreInUseError as error:
-            return replace(self, problem=str(error))
+        path, mine = self.store.calibration, replace(self, lock=ExitStack(), problem='')
+        with ExitStack() as lock:
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                handle = os.open(path.with_name(f'{path.stem}.lock'), _TO_LOCK, 0o644)
+            except OSError:
+                return mine  # the folder cannot be written, so there is nothing to protect
+            lock.callback(os.close, handle)
+            if not stat.S_ISREG(os.fstat(handle).st_mode):
+                return mine
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                holder = os.read(handle, 32).decode(errors='replace').strip() or 'unknown'
+                return replace(self, problem=str(InputError(
+                    f'{path} is used by the node with process id {holder}', 'stop that node, or '
+                    'restart this node with another calibration_file or sensor')))
+            except OSError:
+                return mine  # this file system has no locks
+            with suppress(OSError):  # without space on the disk, the lock does not name its holder
+                os.ftruncate(handle, 0)
+                os.pwrite(handle, f'{os.getpid()}\n'.encode(), 0)
+            return replace(mine, lock=lock.pop_all())
 
     def usable(self) -> Store:
         """Return the locked store; InputError if the sensor is not known, or it is not locked."""

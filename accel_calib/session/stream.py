@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy
+from dataclasses import dataclass, field
 import math
 from typing import Any, NamedTuple
 
@@ -254,22 +255,26 @@ _RECENT = int(2.0 * LONG_REST / _APART)
 """Number of recent points whose columns are kept; they cover the longest rest."""
 
 
+@dataclass(frozen=True, eq=False)
 class TemperatureHistory:
     """
     Temperatures of the last hours, and the columns that a model needs from them.
 
     A calibration that changes while the node runs thus starts with the lag that the sensor has.
 
+    Parameters
+    ----------
+    points : deque of (float, float)
+        Times and temperatures.
+    followed : dict
+        By what a model needs: its stream, and the columns at the recent points. Models that are
+        asked for are followed.
+
     """
 
-    def __init__(self) -> None:
-        self._points: deque[tuple[float, float]] = deque(maxlen=_POINTS)
-        # By what a model needs: its stream, and the columns at the recent points.
-        self._followed: dict[object, tuple[ThermalStream, deque[tuple[float, Any]]]] = {}
-
-    def forget(self) -> None:
-        """Compute no columns any more, except for the models that are asked for from now on."""
-        self._followed.clear()
+    points: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_POINTS))
+    followed: dict[object, tuple[ThermalStream, deque[tuple[float, Any]]]] = field(
+        default_factory=dict)
 
     def add(self, time: Floats, temperature: Floats) -> None:
         """
@@ -283,20 +288,20 @@ class TemperatureHistory:
         if not np.any(known):
             return
         time, temperature = time[known], temperature[known]
-        if self._points and time[-1] < self._points[-1][0]:  # the stream starts again
-            self._points.clear()
-            for _, columns in self._followed.values():
+        if self.points and time[-1] < self.points[-1][0]:  # the stream starts again
+            self.points.clear()
+            for _, columns in self.followed.values():
                 columns.clear()
         back = np.flatnonzero(np.diff(time) < -_APART)
         begin = int(back[-1]) + 1 if len(back) else 0
         while begin < len(time):
-            due = self._points[-1][0] + _APART if self._points else -np.inf
+            due = self.points[-1][0] + _APART if self.points else -np.inf
             later = np.flatnonzero(time[begin:] >= due)
             end = begin + int(later[0]) + 1 if len(later) else len(time)
             now = float(time[end - 1])
             if len(later):
-                self._points.append((now, float(temperature[end - 1])))
-            for stream, columns in self._followed.values():
+                self.points.append((now, float(temperature[end - 1])))
+            for stream, columns in self.followed.values():
                 stream.add_all(time[begin:end], temperature[begin:end])
                 columns.extend([(now, stream.value)] if len(later) else [])
             begin = end
@@ -324,10 +329,10 @@ class TemperatureHistory:
             thermal_stream(model))
         if stream is None:
             return None, ()
-        if key not in self._followed:
+        if key not in self.followed:
             columns = deque[tuple[float, Any]](maxlen=_RECENT)
-            for time, temperature in self._points:
+            for time, temperature in self.points:
                 stream.add(time, temperature)
                 columns.append((time, stream.value))
-            self._followed[key] = stream, columns
-        return self._followed[key]
+            self.followed[key] = stream, columns
+        return self.followed[key]

@@ -8,6 +8,7 @@ Ratings, plans and files take time, so they are tasks, which are added to the ev
 
 """
 
+from dataclasses import replace
 import json
 import math
 
@@ -36,29 +37,28 @@ def adopt(session: Holder, calibration: Calibration | None, refinement: Refineme
           rating: Rating | None = None) -> None:
     """Correct with this calibration, and with the given mounting if there is one."""
     session.change(problem='', is_refused=False)
+    state, settings = session.state, session.state.settings
     if calibration is None:
-        session.change(sensor=session.sensor.adopt(None, session.state.settings))
-        session.state.around.assume({})
+        session.change(sensor=session.sensor.adopt(None, settings))
+        state.around.assume({})
         rate(session, None)
         return
     levelled = calibration.is_levelled
-    if levelled and calibration.frame != session.state.frame:
+    if levelled and calibration.frame != state.frame:
         session.log('warning', f'the stored mounting is for the frame {calibration.frame}, but '
-                    f'frame is {session.state.settings.frame}: it is turned, and a measured '
-                    'heading is kept')
-        calibration = in_frame(calibration, session.state.frame)
-    stored, calibration = calibration, session.state.with_given(calibration)
+                    f'frame is {settings.frame}: it is turned, and a measured heading is kept')
+        calibration = in_frame(calibration, state.frame)
+    stored, calibration = calibration, state.with_given(calibration)
     if levelled and not np.allclose(stored.rotation[:, 2], calibration.rotation[:, 2]):
         session.log('warning', 'the stored mounting differs from the given one by more than 10° '
                     'of tilt: the given mounting is used; call ~/set_level with the robot level')
-    session.change(sensor=session.sensor.adopt(calibration, session.state.settings))
-    session.state.around.assume({
-        key: value for key, value in calibration.typical.items()
-        if key in CONTEXT or is_quantity(key)})
+    session.change(sensor=session.sensor.adopt(calibration, settings))
+    state.around.assume({key: value for key, value in calibration.typical.items()
+                         if key in CONTEXT or is_quantity(key)})
     rate(session, refinement, rating)
-    turned = calibration.is_levelled and session.state.settings.rotate
+    turned = calibration.is_levelled and settings.rotate
     session.log('info', f'correcting with {title(calibration)}; messages are in the frame '
-                f'{session.state.settings.frame if turned else "of the sensor"}')
+                f'{settings.frame if turned else "of the sensor"}')
     for finding in calibration.noted:
         session.log(_SEVERITY[finding.level], finding.words)
     show_mounting(session)
@@ -99,21 +99,23 @@ def _report_rating(session: Holder, calibration: Calibration, refinement: Refine
                 session.state.settings.base_frame)
         command = action.command and f'~/{action.command}'
         session.events.append(Result(json.dumps({
-            **found, **rating_json(rating, action.kind, action.text, command)})))
+            **found, **rating_json(rating, action, command)})))
     return ''
 
 
 def show_poses(session: Holder, *, store: bool, new_rest: Dwell | None = None) -> None:
     """Add a task that stores the poses, and draws them with the next pose."""
     sensor, guide = session.sensor, session.sensor.guide
-    poses = sensor.live.book.poses()
-    session.change_sensor(guide=guide.note(len(poses), session.state.statistics.stamp))
+    poses = sensor.live.poses()
+    if len(poses) != guide.count:
+        session.change_sensor(guide=replace(
+            guide, count=len(poses), new_at=session.state.statistics.stamp))
     session.events.append(_draw_poses(
-        session, sensor, poses, len(poses) - guide.count, new_rest,
-        session.state.files.store if store else None))
+        session, sensor, poses, added=len(poses) - guide.count, new_rest=new_rest,
+        store=session.state.files.store if store else None))
 
 
-def _draw_poses(session: Holder, sensor: Sensor, poses: Poses, added: int,
+def _draw_poses(session: Holder, sensor: Sensor, poses: Poses, *, added: int,
                 new_rest: Dwell | None, store: Store | None) -> Task:
     """Store and draw poses, this number more than before; return the line of a new rest."""
     state, guide, missed = session.state, session.sensor.guide, ''
@@ -159,9 +161,9 @@ def open_files(session: Holder, store: Store, sensor: Sensor) -> Task:
         session.change(is_refused=isinstance(error, StoredCalibrationError) and not isinstance(
             error, DamagedCalibrationError))
         problem = yield Files(unusable, store.calibration, error)
-    if calibration is not None and calibration.stream not in ('', store.identity.topic):
+    if calibration is not None and calibration.stream not in ('', store.topic):
         notes.append(f'{store.calibration} was made for {calibration.stream}, but it is used '
-                     f'for {store.identity.topic}')
+                     f'for {store.topic}')
     try:
         poses = yield Files(store.load_poses)
     except Exception as error:
@@ -171,7 +173,7 @@ def open_files(session: Holder, store: Store, sensor: Sensor) -> Task:
     session.change_sensor(owners=frozenset(
         each.sensor for each in (calibration, poses) if each is not None and each.sensor))
     if poses is not None:
-        sensor.live.book.add_stored(poses)
+        sensor.live.add_stored(poses)
         session.log('info', f'read {counted(len(poses), "pose")} from the store')
     if calibration is not None:
         adopt(session, calibration)

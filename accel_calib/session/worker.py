@@ -35,7 +35,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
 import math
@@ -46,7 +46,7 @@ from select import select
 import signal
 import subprocess
 import sys
-from threading import Lock, Thread
+from threading import RLock, Thread
 from time import monotonic
 from traceback import format_exc
 from typing import Any, BinaryIO, cast, Literal, TypeVar
@@ -87,7 +87,7 @@ class WorkerProcess:
         self._process: subprocess.Popen[bytes] | None = None
         self._closed = False
         self._idle = idle
-        self._turn = Lock()
+        self._turn = RLock()
 
     def start(self) -> None:
         """Start the process unless it is running, without waiting for it."""
@@ -116,7 +116,18 @@ class WorkerProcess:
 
         """
         with self._turn:
-            return self._call(function, given, limit_s)
+            try:
+                good, found = self._ask(pickle.dumps((function, given)), limit_s)
+            except (OSError, EOFError, pickle.UnpicklingError) as err:
+                if self._closed:
+                    raise ClosedError('the node is shutting down', 'start it again') from None
+                self._end()
+                if limit_s is not None:
+                    raise err if isinstance(err, TimeoutError) else EOFError from err
+                return function(*given)
+        if not good:
+            raise found
+        return cast('Found', found)
 
     def call_if_free(self, function: Callable[..., Found], *given: Any) -> Found:
         """Call a function as `call` does, or at once in this process if the other one is busy."""
@@ -124,26 +135,11 @@ class WorkerProcess:
             return function(*given)
         try:
             is_running = self._process is not None and self._process.poll() is None
-            return self._call(function, given) if is_running else function(*given)
+            return self.call(function, *given) if is_running else function(*given)
         except ClosedError:  # what the user has asked to store is stored
             return function(*given)
         finally:
             self._turn.release()
-
-    def _call(self, function: Callable[..., Found], given: tuple[Any, ...],
-              limit_s: float | None = None) -> Found:
-        try:
-            good, found = self._ask(pickle.dumps((function, given)), limit_s)
-        except (OSError, EOFError, pickle.UnpicklingError) as err:
-            if self._closed:
-                raise ClosedError('the node is shutting down', 'start it again') from None
-            self._end()
-            if limit_s is not None:
-                raise err if isinstance(err, TimeoutError) else EOFError from err
-            return function(*given)
-        if not good:
-            raise found
-        return cast('Found', found)
 
     def _ask(self, request: bytes, limit_s: float | None) -> tuple[bool, Any]:
         self.start()
@@ -224,7 +220,8 @@ class Step(partial[Any]):
         given = [each.run(call) if isinstance(each, Step) else each for each in self.args]
         if self.func is nothing:
             return None
-        return self.func(*given) if isinstance(self, Files) else call(self.func, *given)
+        function = partial(self.func, **self.keywords)
+        return function(*given) if isinstance(self, Files) else call(function, *given)
 
 
 class Parse(Step):
@@ -316,19 +313,19 @@ Event = Log | Mounting | Result | Still | ShowPoses | Task
 """What a session reports: log lines, what to publish, and tasks to run."""
 
 
+@dataclass(frozen=True)
 class Throttle:
     """Decide what is due, such as log lines: of each kind, at most one within a time."""
 
-    def __init__(self, clock: Callable[[], float] = monotonic) -> None:
-        self._clock = clock
-        self._last: dict[str, float] = {}
+    clock: Callable[[], float] = monotonic
+    last: dict[str, float] = field(default_factory=dict)
 
     def passes(self, kind: str, once_in: float) -> bool:
         """Return whether one of this kind is due, at most once in `once_in` [s]; note it."""
-        now = self._clock()
-        if now - self._last.get(kind, -math.inf) < once_in:
+        now = self.clock()
+        if now - self.last.get(kind, -math.inf) < once_in:
             return False
-        self._last[kind] = now
+        self.last[kind] = now
         return True
 
 
@@ -368,7 +365,8 @@ class Worker:
         while self._events:
             event = self._events.popleft()
             if isinstance(event, Generator):
-                self.run(event, self._log_answer)
+                self.run(event, lambda success, words: self.log(
+                    'info' if success else 'warning', words))
             else:
                 self._show(event)
 
@@ -377,15 +375,12 @@ class Worker:
         self._events += [Log(severity, words)] if words else []
         self.handle_events()
 
-    def _log_answer(self, success: bool, words: str) -> None:
-        self.log('info' if success else 'warning', words)
-
     def do(self, name: str, command: Task, answer: Answer) -> None:
         """Begin a command when no files are used, run its steps, log its words, and `answer`."""
         def done(success: bool, found: Any) -> None:
             self.running.remove(name)
             if isinstance(found, str):
-                self._log_answer(success, found)
+                self.log('info' if success else 'warning', found)
             answer(success, found)
 
         def fresh() -> Task:

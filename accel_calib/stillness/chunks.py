@@ -174,56 +174,6 @@ def summed(records: Records, size: int) -> Records:
     return numbers.sum(axis=1).view(records.dtype)[:, 0]
 
 
-def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats, kind: np.dtype[Any]
-            ) -> Records:
-    """
-    Return the (m,) chunks of a `chunk_type` with the samples from each start to the next.
-
-    `samples` are (k, n): time and reading (k = 4), with rate (7), with the columns of the context
-    (more). `epoch` and `origin` (6,) are subtracted. Sums of a missing rate are NaN. What `rule`
-    adds is not known yet: no level, one window, and no limit.
-
-    """
-    found = np.zeros(len(starts), kind)
-    found['begin'] = samples[0, starts]
-    found['end'] = samples[0, np.append(starts[1:], samples.shape[1]) - 1]
-    found['step'] = found['limit'] = np.inf
-    sums = found['sums']
-    sums['first'] = sums['second'] = sums['level'] = np.nan
-    sums['windows'] = 1.0
-    reading = samples[1:4]
-    same = np.append(False, np.all(reading[:, 1:] == reading[:, :-1], axis=0))
-    same[starts] = False
-    sums['repeats'] = np.add.reduceat(same.astype(float), starts)
-    sums['zeros'] = np.add.reduceat((~reading.any(axis=0)).astype(float), starts)
-    sums['count'] = np.diff(starts, append=samples.shape[1])
-    sums['time'] = np.add.reduceat(samples[0] - epoch, starts)
-    values = min(len(samples), MOTION) - 1
-    centred = samples[1:1 + values] - origin[:values, np.newaxis]
-    sums['first'][:, :values] = np.add.reduceat(centred, starts, axis=1).T
-    np.multiply(centred, centred, out=centred)
-    sums['second'][:, :values] = np.add.reduceat(centred, starts, axis=1).T
-    around = samples[MOTION:]
-    if len(around):
-        known = np.isfinite(around)
-        sums['context_count'] = np.add.reduceat(known.astype(float), starts, axis=1).T
-        sums['context_sum'] = np.add.reduceat(np.where(known, around, 0.0), starts, axis=1).T
-    return found
-
-
-def smallest_steps(values: Floats, starts: Indices, least: float) -> Floats:
-    """Return the (m,) smallest nonzero steps within chunks, infinite unless below `least`."""
-    step = np.abs(values[:, 1:] - values[:, :-1])
-    if np.count_nonzero(step < least) == np.count_nonzero(step == 0.0):
-        return np.full(len(starts), np.inf)
-    step[~(step > 0.0)] = np.inf
-    lowest = np.full(values.shape[1], np.inf)
-    lowest[1:] = step.min(axis=0)
-    lowest[starts] = np.inf
-    found = np.minimum.reduceat(lowest, starts)
-    return np.asarray(np.where(found < least, found, np.inf))
-
-
 def repeated_extremes(reading: Floats, starts: Indices, highest: Floats) -> tuple[Floats, Floats]:
     """
     Return the (m, 3) samples of each chunk that repeat the extreme of their axis so far.
@@ -318,23 +268,21 @@ class Chunker:
         if not self._origin.size and pending.size:
             first = np.nan_to_num(pending[1:7, 0])
             self._origin = np.pad(first, (0, 6 - len(first)))
-        while self._learned(pending[0], last):
+        while self._period >= 0.0 or pending.shape[1] > (1 if last else _LEARN):
+            if self._period < 0.0:  # of a new segment, it is not known yet
+                steps = np.diff(pending[0, :_LEARN + 1])
+                median = float(np.median(steps))
+                self._period = median if median > 0.0 else max(float(np.mean(steps)), 0.0)
+                self._length = max(self._shortest, 2.0 * self._period)  # two samples
+                self._epoch = self._latest = float(pending[0, 0])
             time = self._before_break(pending[0])
             index = np.floor((time - self._epoch) / self._length)
             starts = np.append(0, np.flatnonzero(index[1:] != index[:-1]) + 1)
             if stop := int(starts[-1]):  # where the last chunk starts, which is not complete
                 self._latest = float(time[stop - 1])
-                done, starts = pending[:, :stop], starts[:-1]
-                found = sums_of(done, starts, self._epoch, self._origin, self._kind)
-                found['sums']['at_limit'], self._highest = repeated_extremes(
-                    done[1:4], starts, self._highest)
-                for which in range(min(len(done), MOTION) // 3):
-                    step = smallest_steps(
-                        done[1 + 3 * which:4 + 3 * which], starts, self._least[which])
-                    self._least[which] = min(self._least[which], float(step.min()))
-                    found['step'][:, which] = step
-                yield Chunks(found, self._epoch, self._origin, self._length, self._period,
-                             self.fresh)
+                yield Chunks(records=self._sum(pending[:, :stop], starts[:-1]), epoch=self._epoch,
+                             origin=self._origin, length=self._length, period=self._period,
+                             fresh=self.fresh)
                 self.fresh = False
             if len(time) == pending.shape[1]:
                 pending = pending[:, stop:]
@@ -352,17 +300,51 @@ class Chunker:
         self._period = -1.0
         self.fresh = True
 
-    def _learned(self, time: Floats, last: bool) -> bool:
-        if self._period >= 0.0:
-            return True
-        if len(time) <= (1 if last else _LEARN):
-            return False
-        steps = np.diff(time[:_LEARN + 1])
-        median = float(np.median(steps))
-        self._period = median if median > 0.0 else max(float(np.mean(steps)), 0.0)
-        self._length = max(self._shortest, 2.0 * self._period)  # two samples
-        self._epoch = self._latest = float(time[0])
-        return True
+    def _sum(self, samples: Floats, starts: Indices) -> Records:
+        """
+        Return the (m,) chunks of a `chunk_type` with the samples from each start to the next.
+
+        `samples` are (k, n): time and reading (k = 4), with rate (7), with the columns of the
+        context (more). Sums of a missing rate are NaN. A step is infinite unless it is smaller
+        than all before. What `rule` adds is not known yet: no level, one window, and no limit.
+
+        """
+        found = np.zeros(len(starts), self._kind)
+        found['begin'] = samples[0, starts]
+        found['end'] = samples[0, np.append(starts[1:], samples.shape[1]) - 1]
+        found['step'] = found['limit'] = np.inf
+        sums = found['sums']
+        sums['first'] = sums['second'] = sums['level'] = np.nan
+        sums['windows'] = 1.0
+        reading = samples[1:4]
+        same = np.append(False, np.all(reading[:, 1:] == reading[:, :-1], axis=0))
+        same[starts] = False
+        sums['repeats'] = np.add.reduceat(same.astype(float), starts)
+        sums['zeros'] = np.add.reduceat((~reading.any(axis=0)).astype(float), starts)
+        sums['at_limit'], self._highest = repeated_extremes(reading, starts, self._highest)
+        sums['count'] = np.diff(starts, append=samples.shape[1])
+        sums['time'] = np.add.reduceat(samples[0] - self._epoch, starts)
+        values = min(len(samples), MOTION) - 1
+        centred = samples[1:1 + values] - self._origin[:values, np.newaxis]
+        sums['first'][:, :values] = np.add.reduceat(centred, starts, axis=1).T
+        np.multiply(centred, centred, out=centred)
+        sums['second'][:, :values] = np.add.reduceat(centred, starts, axis=1).T
+        around = samples[MOTION:]
+        if len(around):
+            known = np.isfinite(around)
+            sums['context_count'] = np.add.reduceat(known.astype(float), starts, axis=1).T
+            sums['context_sum'] = np.add.reduceat(np.where(known, around, 0.0), starts, axis=1).T
+        for which, least in enumerate(self._least[:values // 3]):
+            axes = samples[1 + 3 * which:4 + 3 * which]
+            step = np.abs(axes[:, 1:] - axes[:, :-1])
+            if np.count_nonzero(step < least) > np.count_nonzero(step == 0.0):
+                step[~(step > 0.0)] = np.inf
+                lowest = np.append(np.inf, step.min(axis=0))
+                lowest[starts] = np.inf
+                smallest = np.minimum.reduceat(lowest, starts)
+                found['step'][:, which] = np.where(smallest < least, smallest, np.inf)
+                self._least[which] = min(least, float(smallest.min()))
+        return found
 
     def _before_break(self, time: Floats) -> Floats:
         """Return the stamps before the first interruption; one that steps back is the latest."""

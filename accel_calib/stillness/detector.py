@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from .account import MISSING, Rest
 from .chunks import (
     CaptureSettings, chained, Chunker, Chunks, CHUNKS_PER_WINDOW, Interruption, MOTION, Records)
-from .dwell import Dwell, figures, figures_type, judged, OngoingDwell, Tracker
+from .dwell import Dwell, figures, judged, OngoingDwell, Tracker
 from .levels import Known
 from .rule import Rule
 from .sensor import Lengths
@@ -49,7 +49,7 @@ class StillDetector:
     further columns of the samples: temperature, supply voltage, and quantities. `still` is whether
     the sensor is still now. `refused` are the rests that ended in the last `push` or `close`, and
     are no poses, and `missing` the most recent times at which samples are missing, at most 10,000.
-    `known` is what another detector of these samples found.
+    `known` is what another detector of these samples found, and `rule` has what this one learned.
 
     """
 
@@ -57,10 +57,10 @@ class StillDetector:
                  context: Sequence[str] = CONTEXT, known: Known = Known()) -> None:
         self._context = context
         self._chunker = Chunker(settings, len(context))
-        self._rule = Rule(settings, units, known)
-        self._tracker = Tracker(settings, self._rule)
+        self.rule = Rule(settings, units, known)
+        self._tracker = Tracker(settings, self.rule)
         self._most = keep
-        self._kept = np.empty(0, figures_type(len(context)))
+        self._kept: Records = np.empty(0)  # the figures of finished dwells
         self.still = False
         self._least, self._largest = np.full(4, np.inf), np.full(4, -np.inf)  # x, y, z, |reading|²
         self.refused: tuple[Rest, ...] = ()
@@ -81,7 +81,7 @@ class StillDetector:
         known = np.any(~np.isnan(samples), axis=0)
         rows = len(known) if known[MOTION:].any() else MOTION if known[4:MOTION].any() else 4
         found = self._ended(self._feed([np.ascontiguousarray(samples[:, :rows].T)], last=False))
-        self._rule.least = self._rule.levels.least
+        self.rule.least = self.rule.levels.least
         return found
 
     def add_recording(self, recording: Recording) -> None:
@@ -104,8 +104,8 @@ class StillDetector:
         dwell = self._tracker.current()
         if dwell is None:
             return None
-        now = figures(dwell, known_units=self._rule.known)
-        found, = judged(chained(self._kept[-_BESIDE:], now), self._rule, self._context)[-1:]
+        now = figures(dwell, known_units=self.rule.known)
+        found, = judged(chained(self._kept[-_BESIDE:], now), self.rule, self._context)[-1:]
         return None if found.reason else found
 
     def dwells(self) -> list[Dwell]:
@@ -114,12 +114,7 @@ class StillDetector:
 
     def judged(self) -> list[Dwell]:
         """Return the kept dwells with the reason why they are no poses with the noise now."""
-        return judged(self._kept, self._rule, self._context) if len(self._kept) else []
-
-    @property
-    def known(self) -> Known:
-        """Return what the samples so far show about the sensor."""
-        return Known(self._rule.levels.least, self._rule.repeats)
+        return judged(self._kept, self.rule, self._context) if len(self._kept) else []
 
     @property
     def lengths(self) -> Lengths:
@@ -136,13 +131,8 @@ class StillDetector:
 
         """
         mean = np.nan_to_num(self._mean)[:, np.newaxis]
-        limit = self._rule.limit_of(self._rule.noise_of(mean))
+        limit = self.rule.limit_of(self.rule.noise_of(mean))
         return float(np.sqrt(np.max(limit[:3])))
-
-    @property
-    def quietest(self) -> float:
-        """Return the standard deviation in the quietest window [unit of the readings]."""
-        return math.sqrt(self._rule.quietest)
 
     @property
     def interruptions(self) -> tuple[Interruption, ...]:
@@ -169,7 +159,7 @@ class StillDetector:
             if chunks.fresh:
                 yield from self._tracker.close()
                 self._tracker.start(chunks)
-            verdict = self._rule.feed(chunks)
+            verdict = self.rule.feed(chunks)
             self._miss(verdict, chunks.length)
             yield from self._tracker.feed(verdict)
             self.still = bool(verdict['still'][-1])
@@ -185,7 +175,7 @@ class StillDetector:
         if self._most is not None:  # only the account of a recording has the short ones
             found = [each for each in found if not each.short]
         every = chained(self._kept, *(
-            figures(each, known_units=self._rule.known) for each in found))
+            figures(each, known_units=self.rule.known) for each in found))
         self._kept = every if self._most is None else every[-self._most:]
         return len(found)
 
@@ -194,7 +184,7 @@ class StillDetector:
         count = min(self._keep(found), len(self._kept))
         if not count:
             return []
-        every = judged(self._kept[-count - _BESIDE:], self._rule, self._context)[-count:]
+        every = judged(self._kept[-count - _BESIDE:], self.rule, self._context)[-count:]
         self.refused += tuple(each.rest for each in every if each.reason)
         return [each for each in every if not each.reason]
 
@@ -283,10 +273,12 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     interruptions = detector.interruptions
     seconds = times[-1] - times[0] if times else 0.0
     return Captured(
-        replace(poses_from(dwells, settings), **about), sum(each.samples for each in dwells),
-        detector.threshold, seconds - sum(each.seconds for each in interruptions), interruptions,
-        recorded, detector.quietest, tuple(sorted((*rests, *detector.missing))), detector.lengths,
-        detector.known)
+        poses=replace(poses_from(dwells, settings), **about),
+        samples=sum(each.samples for each in dwells), threshold=detector.threshold,
+        seconds=seconds - sum(each.seconds for each in interruptions),
+        interruptions=interruptions, recorded=recorded, quietest=math.sqrt(detector.rule.quietest),
+        rests=tuple(sorted((*rests, *detector.missing))), lengths=detector.lengths,
+        known=Known(detector.rule.levels.least, detector.rule.repeats))
 
 
 def samples_of(recording: Recording, start: int, stop: int, context: Sequence[str] = CONTEXT

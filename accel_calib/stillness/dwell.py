@@ -48,7 +48,6 @@ from collections.abc import Iterator, Mapping, Sequence
 import copy
 from dataclasses import dataclass, field
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,15 +79,11 @@ _FIGURES = [
 """Means and variances in the unit of the readings, slopes per second."""
 
 
-def figures_type(columns: int) -> np.dtype[Any]:
-    """Return the type of the figures of a dwell, with the means of its columns of context."""
-    return np.dtype([*_FIGURES, ('around', float, (columns,))])
-
-
 def figures(dwell: OngoingDwell, *, known_units: bool) -> Records:
     """Return the record of figures of a dwell; with known units its mean is nearly vertical."""
     total = dwell.total()[0]
-    found = np.empty(1, figures_type(len(total['context_sum'])))
+    known = total['context_count']
+    found = np.empty(1, np.dtype([*_FIGURES, ('around', float, known.shape)]))
     count = total['count']
     shift = total['first'] / count
     square = np.maximum(total['second'] - total['first'] * shift, 0.0)
@@ -100,7 +95,6 @@ def figures(dwell: OngoingDwell, *, known_units: bool) -> Records:
         found[name] = getattr(dwell, name)
     found['time'] = dwell.epoch + total['time'] / count
     found['samples'], found['at_limit'] = count, total['at_limit'] / count
-    known = total['context_count']
     found['around'] = np.where(known > 0.0, total['context_sum'], np.nan) / np.maximum(known, 1.0)
 
     cells, spacing = dwell.cells, dwell.size * dwell.length
@@ -210,7 +204,8 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -
     All dwells of the table of `figures` are used. `context` names its columns of context.
 
     """
-    means, std, (step, rate_step) = table['mean'][:, :3], table['std'], rule.steps
+    means, std = table['mean'][:, :3], table['std']
+    step, rate_step = np.where(np.isfinite(rule.steps), rule.steps, 0.0).tolist()
     tiny = RELATIVE * np.sqrt(np.sum(means.T**2, axis=0))
     quiet, excess, reason = _reasons(table, rule, tiny)
     turned = np.ptp(means, axis=0) > _STUCK * np.max(np.abs(means))  # else an axis is stuck
@@ -235,9 +230,10 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -
         if np.isfinite(mean).all():
             around['rate'] = mean[3:]
         found.append(Dwell(
-            float(each['begin']), float(each['end']), float(each['time']), mean[:3], own, float(n),
-            int(each['samples']), around, int(each['orientation']), rate_std=own_rate,
-            reason=str(why), at_limit=bool(at_limit)))
+            start=float(each['begin']), end=float(each['end']), time=float(each['time']),
+            mean=mean[:3], std=own, count=float(n), samples=int(each['samples']), context=around,
+            orientation=int(each['orientation']), rate_std=own_rate, reason=str(why),
+            at_limit=bool(at_limit)))
     return found
 
 
@@ -246,12 +242,14 @@ def _reasons(table: Records, rule: Rule, tiny: Floats
     """
     Return which dwells are quiet, the excess of their noise, and why they are no poses.
 
-    `tiny` is the standard deviation of each below which it repeats one reading.
+    `tiny` is the standard deviation of each below which it repeats one reading. The bias of the
+    gyro is the median over the quiet dwells. A rate about the vertical does not change a pose and
+    is ignored. A gyro beside native readings may be in counts and is not used.
 
     """
-    mean, slope, scale = table['mean'].T, table['slope'].T, rule.scale
+    mean, slope, average, scale = table['mean'].T, table['slope'].T, table['average'].T, rule.scale
     limit = rule.limit_of(rule.noise_of(mean), DWELL_RATIO, DWELL_RATE_RATIO)
-    sloping = rule.is_steep(slope, np.asarray(scale), table['average'].T[:3], DWELL_SLOPE_G)
+    sloping = rule.is_steep(slope, np.asarray(scale), average[:3], DWELL_SLOPE_G)
     sloping &= table['strength'] > np.where(table['beside_slope'], WEAK_STRENGTH, STRENGTH)
     sloping |= (scale > 0.0) & np.any((table['part_slope'] > PART_SLOPE_G * scale)
                                       & (table['part_strength'] > PART_STRENGTH), axis=1)
@@ -263,35 +261,23 @@ def _reasons(table: Records, rule: Rule, tiny: Floats
     own = np.stack([table['excess'], table['along']])
     common = np.median(own[:, quiet], axis=1, keepdims=True) if quiet.any() else 1.0
     across, along = np.maximum(np.maximum(common, 1.0), own / _OWN_EXCESS)
-    found['turning'], sure = _by_gyro(table, quiet, rule)
+    up, rates = mean[:3], mean[3:]
+    known = quiet & np.isfinite(rates).all(axis=0)
+    found['turning'] = sure = np.zeros_like(quiet)
+    if rule.known and known.sum() >= _BIAS_DWELLS:
+        off = rates - np.median(rates[:, known], axis=1, keepdims=True)
+        spread = SIGMA_OF_MAD * float(np.max(np.median(np.abs(off[:, known]), axis=1)))
+        tilting = (np.linalg.norm(np.cross(off, up, axis=0), axis=0)
+                   / np.maximum(np.linalg.norm(up, axis=0), 1e-300))
+        found['turning'] = known & (tilting > max(_GYRO_RATE, 2.0 * _SPREADS * spread))
+        sure = known & (tilting < _GYRO_RATE) & (_SPREADS * spread < _GYRO_RATE)
+        sure &= np.all(average[3:] > 0.0, axis=0)  # else the gyro is off
     turn = np.sqrt(np.sum(slope**2, axis=0)) + SURE * table['error'] * np.sqrt(across)
     found['noisy'] = ~sure & ~((turn < TURN_G * scale) | (scale == 0.0))
     good = ~np.any(list(found.values()), axis=0)
     found['length'] = np.zeros(len(table), bool)
     found['length'][good] = ~rule.reads_gravity(table['mean'][:, :3][good])
     return quiet, np.minimum(across, along), np.select(list(found.values()), list(found), '')
-
-
-def _by_gyro(table: Records, quiet: NDArray[np.bool_], rule: Rule
-             ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """
-    Return which dwells are turning according to the gyro, and which are certainly not.
-
-    The bias of the gyro is the median over the quiet dwells. A rate about the vertical does not
-    change a pose and is ignored. A gyro beside native readings may be in counts and is not used.
-
-    """
-    up, rates = table['mean'].T[:3], table['mean'].T[3:]
-    known = quiet & np.isfinite(rates).all(axis=0)
-    if not rule.known or known.sum() < _BIAS_DWELLS:
-        return np.zeros_like(quiet), np.zeros_like(quiet)
-    off = rates - np.median(rates[:, known], axis=1, keepdims=True)
-    spread = SIGMA_OF_MAD * float(np.max(np.median(np.abs(off[:, known]), axis=1)))
-    tilting = (np.linalg.norm(np.cross(off, up, axis=0), axis=0)
-               / np.maximum(np.linalg.norm(up, axis=0), 1e-300))
-    alive = np.all(table['average'].T[3:] > 0.0, axis=0)
-    sure = known & alive & (tilting < _GYRO_RATE) & (_SPREADS * spread < _GYRO_RATE)
-    return known & (tilting > max(_GYRO_RATE, 2.0 * _SPREADS * spread)), sure
 
 
 CELLS = 256
@@ -345,15 +331,6 @@ class OngoingDwell:
         every = chained(self.cells, self._partial)
         return summed(every, len(every))
 
-    def continued_by(self, sums: Records, scale: float) -> bool:
-        """Return whether these chunks have the same mean reading as the dwell."""
-        old, new = self.total(), summed(sums, len(sums))
-        level = np.maximum(old['level'] / np.maximum(old['windows'], 1.0)[:, np.newaxis],
-                           new['level'] / new['windows'][:, np.newaxis])[0, :3]
-        apart = np.abs(old['first'] / old['count'][:, np.newaxis]
-                       - new['first'] / new['count'][:, np.newaxis])[0, :3]
-        return bool(np.all(apart <= np.sqrt(level) + _AGREE_G * scale))
-
 
 _SAMPLES = 16
 """Smallest number of samples in a dwell."""
@@ -400,13 +377,34 @@ class Tracker:
 
         """
         waiting = chained(self._waiting, chunks)
-        verdict = _verdict(waiting, last)
+        size, still = len(waiting), waiting['still']
+        index = np.arange(size)
+        nearest = np.where(still, 2 * size + HORIZON, index)
+        ended = np.minimum.accumulate(nearest[::-1])[::-1]
+        due = np.minimum(index + HORIZON, ended)
+        if last:
+            due = np.minimum(due, size - 1)
+        count = int(np.searchsorted(due, size))
+        due, ended, self._waiting = due[:count], ended[:count], waiting[count:]
+        missing = np.append(waiting['missing'] > 0, np.zeros(CHUNKS_PER_WINDOW, bool))
+        beside = np.lib.stride_tricks.sliding_window_view(missing, CHUNKS_PER_WINDOW)[:count]
+        over = np.any(waiting['sums']['level'][:count] > waiting['limit'][due], axis=1)
+        slope = np.append(waiting['trending'], 0)[np.minimum(ended, size)]
+        verdict = still[:count] & ~over & (ended - index[:count] >= slope) & ~beside.any(axis=1)
         edges = np.flatnonzero(np.diff(verdict)) + 1
-        for start, stop in zip([0, *edges], [*edges, len(verdict)]):
-            if stop > start:
-                part = waiting[start:stop]
-                yield from self._extend(part) if verdict[start] else self._skip(part)
-        self._waiting = waiting[len(verdict):]
+        for start, stop in zip([0, *edges] if count else [], [*edges, count]):
+            part = waiting[start:stop]
+            if verdict[start]:
+                yield from self._extend(part)
+                continue
+            self._pause += len(part)
+            self._lead = chained(self._lead, part[-_LEAD:])[-_LEAD:]
+            self._held = _NONE
+            sloping = bool((part['trending'] > 0).any())
+            self._beside_slope |= sloping
+            if self._pause > KNOCK or sloping:
+                yield from self._end()
+            self._beside_slope = sloping or (self._beside_slope and self._dwell is not None)
 
     def close(self) -> list[OngoingDwell]:
         """End the ongoing dwell because no chunk follows, and return all dwells that end."""
@@ -419,26 +417,22 @@ class Tracker:
         twin = copy.copy(self)
         twin._dwell = copy.copy(self._dwell)
         list(twin.feed(last=True))
-        found = twin._finished()
-        return None if found is None or found.short else found
-
-    def _skip(self, chunks: Records) -> Iterator[OngoingDwell]:
-        self._pause += len(chunks)
-        self._lead = chained(self._lead, chunks[-_LEAD:])[-_LEAD:]
-        self._held = _NONE
-        sloping = bool((chunks['trending'] > 0).any())
-        self._beside_slope |= sloping
-        if self._pause > KNOCK or sloping:
-            yield from self._end()
-        self._beside_slope = sloping or (self._beside_slope and self._dwell is not None)
+        return next((each for each in twin._end() if not each.short), None)
 
     def _extend(self, chunks: Records) -> Iterator[OngoingDwell]:
         before = self._held
         if self._pause or self._dwell is None:
             before = self._lead.copy()  # without its windows, which are not still
             before['sums']['level'] = before['sums']['windows'] = 0.0
-            if (self._dwell is None or not self._dwell.chunks or not self._dwell.continued_by(
-                    chained(before, chunks[:1])['sums'], self._rule.scale)):
+            is_same = False  # the mean reading before and after the pause
+            if self._dwell is not None and self._dwell.chunks:
+                old, after = self._dwell.total()[0], chained(before, chunks[:1])['sums']
+                new = summed(after, len(after))[0]
+                level = np.maximum(old['level'] / max(old['windows'], 1.0),
+                                   new['level'] / new['windows'])[:3]
+                apart = np.abs(old['first'] / old['count'] - new['first'] / new['count'])[:3]
+                is_same = bool(np.all(apart <= np.sqrt(level) + _AGREE_G * self._rule.scale))
+            if not is_same:
                 yield from self._end()
                 self._dwell = OngoingDwell(self._chunks, self._number)
             self._pause = 0
@@ -455,39 +449,13 @@ class Tracker:
         self._dwell.add(chunks)
 
     def _end(self) -> Iterator[OngoingDwell]:
-        found = self._finished()
+        found, self._dwell, self._held = self._dwell, None, _NONE
         if found is not None:
-            yield found
-        if self._dwell is not None:
             self._number += 1
-        self._dwell = None
-        self._held = _NONE
-
-    def _finished(self) -> OngoingDwell | None:
-        least = min(max(_LEAST_REST * self._shortest, CHUNKS_PER_WINDOW), self._shortest)
-        if self._longest:  # the end of a rest that was split is no rest
-            least = self._shortest
-        if self._dwell is None or self._dwell.chunks < least:
-            return None
-        self._dwell.beside_slope = self._beside_slope
-        self._dwell.short = self._dwell.chunks < self._shortest
-        return self._dwell
-
-
-def _verdict(chunks: Records, last: bool) -> NDArray[np.bool_]:
-    """Return the final verdict on the first chunks, as many as can be decided now."""
-    size, still = len(chunks), chunks['still']
-    index = np.arange(size)
-    nearest = np.where(still, 2 * size + HORIZON, index)
-    ended = np.minimum.accumulate(nearest[::-1])[::-1]
-    due = np.minimum(index + HORIZON, ended)
-    if last:
-        due = np.minimum(due, size - 1)
-    count = int(np.searchsorted(due, size))
-    due, ended = due[:count], ended[:count]
-    missing = np.append(chunks['missing'] > 0, np.zeros(CHUNKS_PER_WINDOW, bool))
-    beside = np.lib.stride_tricks.sliding_window_view(missing, CHUNKS_PER_WINDOW)[:count]
-    over = np.any(chunks['sums']['level'][:count] > chunks['limit'][due], axis=1)
-    slope = np.append(chunks['trending'], 0)[np.minimum(ended, size)]
-    return np.asarray(still[:count] & ~over & ~(ended - index[:count] < slope)
-                      & ~beside.any(axis=1))
+            found.beside_slope = self._beside_slope
+            found.short = found.chunks < self._shortest
+            # The end of a rest that was split is no rest.
+            least = self._shortest if self._longest else min(
+                max(_LEAST_REST * self._shortest, CHUNKS_PER_WINDOW), self._shortest)
+            if found.chunks >= least:
+                yield found

@@ -183,7 +183,13 @@ def ramp_of(cells: Poses) -> Ramp:
                          f'least {LEAST_RANGE:g} °C', 'cool the board in a freezer, and record '
                          'while it warms up to room temperature')
     still = _is_still(cells)
-    _check_direction(cells, still)
+    up = unit(cells.reading)
+    first = unit(np.median(up[still][:_FIRST], axis=0)[np.newaxis])[0]
+    away = np.arccos(np.clip(up @ first, -1.0, 1.0))
+    turned = np.flatnonzero((away > _TURNED) & still)
+    if len(turned):
+        raise _moved(cells['time'][turned[0]] - cells['time'][0],
+                     f'it was turned by {np.degrees(away[turned[0]]):.0f}°')
     stretches = _averaged(cells.take(np.isfinite(cells['temperature']) & still))
     _check_jumps(stretches)
     warm, rate = stretches['temperature'], stretches['temperature_rate']
@@ -209,17 +215,6 @@ def ramp_of(cells: Poses) -> Ramp:
                      f'temperature changes by more than {FASTEST:g} °C/min')
     return Ramp(stretches.take(slow), both,
                 float(cells['time'][-1] - cells['time'][0]), tuple(notes))
-
-
-def _check_direction(cells: Poses, still: NDArray[np.bool_]) -> None:
-    """Refuse a board that was turned."""
-    up = unit(cells.reading)
-    first = unit(np.median(up[still][:_FIRST], axis=0)[np.newaxis])[0]
-    away = np.arccos(np.clip(up @ first, -1.0, 1.0))
-    turned = np.flatnonzero((away > _TURNED) & still)
-    if len(turned):
-        raise _moved(cells['time'][turned[0]] - cells['time'][0],
-                     f'it was turned by {np.degrees(away[turned[0]]):.0f}°')
 
 
 def _moved(seconds: float, what: str) -> InputError:

@@ -25,9 +25,8 @@ for white noise and close for AR(1) noise). The upper end of this range, v exp(2
 upper bound of the noise if the sensor is still, and far above it if the sensor moves; so its
 minimum so far is used. The noise is at least the variance that the resolution causes: a reading
 that alternates between two steps of height q has a variance of up to q²/4, and q is the smallest
-step so far. Nothing is learned from an axis at the limit of the sensor, whose samples scatter less
-(see `clipped`), nor from a gyro that does not vary. What is far quieter than all rests is none
-(`levels`).
+step so far. Nothing is learned from an axis at the limit of the sensor, whose samples scatter
+less, nor from a gyro that does not vary. What is far quieter than all rests is none (`levels`).
 
 **Rounding.** Samples x = μ + n with noise n of the standard deviation σ are rounded to multiples
 of q. The error of the mean of many samples depends on μ. Over all μ its variance is
@@ -152,6 +151,7 @@ class Rule:
     """
     The rule with its state: the last chunks, and noise and resolution so far.
 
+    `steps` (2,) are the smallest steps between successive readings, and rates; at first infinite.
     `quietest` is the variance of the axis with the largest one, in the quietest window so far, and
     `repeats` whether a rest can repeat one reading, as that of a coarse sensor does. `least` are
     the (6,) variances below which nothing is a rest of this sensor, 0 if they are not known. Only
@@ -172,7 +172,7 @@ class Rule:
         self._counts = np.zeros(2)  # stretches that varied, and that did not
         self._same, self._seen = 0.0, 0
         self.repeats = True
-        self._step = np.full(2, np.inf)
+        self.steps = np.full(2, np.inf)
         self.quietest = math.inf
 
     @property
@@ -181,18 +181,14 @@ class Rule:
         return self._per_g if self.known else float(_half_range(
             self._lowest, self._highest, self._floors[int(self.repeats), :3]))
 
-    @property
-    def steps(self) -> tuple[float, float]:
-        """Return the smallest steps between successive readings, and rates; 0 before the first."""
-        reading, rate = np.where(np.isfinite(self._step), self._step, 0.0).tolist()
-        return reading, rate
-
     def noise_of(self, mean: Floats) -> Floats:
         """Return the variance of the noise of the sensor as known now, for (6, n) means."""
         axes = len(mean)
         noise = at_least(self._floors[int(self.repeats), :axes, np.newaxis],
-                         self._step[:, np.newaxis], mean)
-        return at_least_any(np.fmax(noise, self.least[:axes, np.newaxis]), np.asarray(self.scale))
+                         self.steps[:, np.newaxis], mean)
+        noise = np.fmax(noise, self.least[:axes, np.newaxis])
+        noise[:3] = np.fmax(noise[:3], (STD_FLOOR_G * self.scale)**2)
+        return noise
 
     def limit_of(self, noise: Floats, ratio: float = VARIANCE_RATIO,
                  rate_ratio: float = RATE_RATIO) -> Floats:
@@ -237,9 +233,16 @@ class Rule:
         measured = missing == 0
         self.quietest = float(np.fmin.reduce(
             recent[:3].max(axis=0)[measured], initial=self.quietest))
-        scale = self._scales(
-            mean, measured & np.all(recent <= self.limit_of(noise), axis=0), noise)
-        limit = self.limit_of(at_least_any(noise, scale))
+        scale = np.asarray(self._per_g)
+        if not self.known:
+            calm = measured & np.all(recent <= self.limit_of(noise), axis=0)
+            at_rest = np.where(calm, mean[:3], np.nan)
+            low = np.fmin.accumulate(np.column_stack([self._lowest, at_rest]), axis=1)[:, 1:]
+            high = np.fmax.accumulate(np.column_stack([self._highest, at_rest]), axis=1)[:, 1:]
+            self._lowest, self._highest = low[:, -1], high[:, -1]
+            scale = _half_range(low, high, noise[:3])
+        noise[:3] = np.fmax(noise[:3], (STD_FLOOR_G * scale)**2)
+        limit = self.limit_of(noise)
         judged['sums']['level'][:, :axes], judged['limit'][:, :axes] = recent.T, limit.T
         judged['missing'], judged['trending'] = missing, self._trending(seen, mean, limit, scale)
         still = measured & (judged['trending'] == 0) & np.all(recent[:3] <= limit[:3], axis=0)
@@ -268,15 +271,31 @@ class Rule:
 
         An offset and the gains by axis are common to all rests: once these determine them, they do
         not count as a difference. Before, the differences that a sensor can have are allowed.
+        The ellipsoid of the rests has its axes along those of the sensor: Σ a x² + b x = 1. Rests
+        are left out, that which decreases the sum of squares most first, until the others agree.
 
         """
         if not self.known:
             return np.ones(len(means), bool)
-        lengths = common_lengths(means / self._per_g)
-        if lengths is None:
-            length = np.linalg.norm(means, axis=1) / self._per_g
-            return np.asarray((length > PLAUSIBLE_G[0]) & (length < PLAUSIBLE_G[1]))
-        return np.asarray(np.abs(lengths - 1.0) <= self._settings.still_norm_tolerance)
+        means_g = means / self._per_g
+        columns, kept = np.hstack([means_g**2, means_g]), np.arange(len(means_g))
+        while len(kept) >= max(FEWEST_IN_COMMON, LEAST_IN_COMMON * len(means_g)):
+            onto, sizes, turn = np.linalg.svd(columns[kept], full_matrices=False)
+            values = (onto.sum(axis=0) / np.maximum(sizes, 1e-300)) @ turn
+            if sizes[-1] < LEAST_SPREAD * sizes[0] or np.any(values[:3] <= 0.0):
+                break
+            centre = -values[3:] / (2.0 * values[:3])
+            radius = np.sqrt((1.0 + np.sum(values[:3] * centre**2)) / values[:3])
+            lengths = np.linalg.norm((means_g - centre) / radius, axis=1)
+            if rms(lengths[kept] - 1.0) < AGREE_G:
+                if np.any(np.abs(centre) >= LARGEST_OFFSET_G):
+                    break
+                return np.asarray(np.abs(lengths - 1.0) <= self._settings.still_norm_tolerance)
+            left = columns[kept] @ values - 1.0
+            own = np.maximum(1.0 - np.sum(onto**2, axis=1), 1e-9)
+            kept = np.delete(kept, np.argmax(left**2 / own))
+        length = np.linalg.norm(means_g, axis=1)
+        return np.asarray((length > PLAUSIBLE_G[0]) & (length < PLAUSIBLE_G[1]))
 
     def _trending(self, seen: Mapping[int, Stretch], mean: Floats, limit: Floats, scale: Floats
                   ) -> NDArray[np.intp]:
@@ -296,15 +315,6 @@ class Rule:
             trending[calm & moved] = length
         return trending
 
-    def _scales(self, mean: Floats, quiet: NDArray[np.bool_], noise: Floats) -> Floats:
-        if self.known:
-            return np.asarray(self._per_g)
-        at_rest = np.where(quiet, mean[:3], np.nan)
-        low = np.fmin.accumulate(np.column_stack([self._lowest, at_rest]), axis=1)[:, 1:]
-        high = np.fmax.accumulate(np.column_stack([self._highest, at_rest]), axis=1)[:, 1:]
-        self._lowest, self._highest = low[:, -1], high[:, -1]
-        return _half_range(low, high, noise[:3])
-
     def _learn(self, seen: Stretch, mean: Floats, step: Floats, zero: NDArray[np.bool_],
                repeated: NDArray[np.bool_], off: NDArray[np.bool_]
                ) -> tuple[Floats, NDArray[np.bool_]]:
@@ -318,8 +328,11 @@ class Rule:
         axes = len(mean)
         dof = np.maximum(2.0 * seen.samples / (1.0 + seen.excess), 1.0)
         average = seen.variance * np.repeat(np.exp(2.0 * np.sqrt(2.0 / dof)), 3, axis=0)
-        steps = np.minimum.accumulate(np.column_stack([self._step, step]), axis=1)[:, 1:]
-        average[:3][clipped(average, seen.at_limit, steps, mean)] = np.nan
+        steps = np.minimum.accumulate(np.column_stack([self.steps, step]), axis=1)[:, 1:]
+        # Axes that end at a limit while another axis varies by more than rounding.
+        least = at_least(np.zeros_like(mean[:3]), steps, mean[:3])
+        ends = (average[:3] <= _tiny(mean[:3])) | (seen.at_limit > AT_LIMIT)
+        average[:3][ends & np.any(average[:3] > 2.0 * least, axis=0)] = np.nan
         average[3:][off] = np.nan
         floors = np.where([repeated[np.newaxis], zero[np.newaxis]], np.nan, average)
         floors[:, :, 0] = np.fmin(floors[:, :, 0], self._floors[:, :axes])
@@ -342,36 +355,10 @@ class Rule:
         share = VARIED_SHARE * np.minimum(counts[1], MOST_REPEATED)
         varied = (counts[0] >= np.maximum(share, CHUNKS_PER_WINDOW)) & (chance < BY_CHANCE)
         varied |= not self._given.repeats
-        self._floors[:, :axes], self._step = floors[:, :, -1], steps[:, -1]
+        self._floors[:, :axes], self.steps = floors[:, :, -1], steps[:, -1]
         self._counts, self._same, self.repeats = counts[:, -1], float(same[-1]), not varied[-1]
         noise = np.fmax(np.where(varied, floors[0], floors[1]), self.least[:axes, np.newaxis])
         return at_least(noise, steps, mean), varied
-
-
-def common_lengths(means_g: Floats) -> Floats | None:
-    """
-    Return the (n,) lengths of (n, 3) rests relative to the ellipsoid that they have in common [g].
-
-    It has its axes along those of the sensor: Σ a x² + b x = 1. Rests are left out, that which
-    decreases the sum of squares most first, until the others agree. None if they do not, do not
-    determine it, or if it is not that of a sensor.
-
-    """
-    columns, kept = np.hstack([means_g**2, means_g]), np.arange(len(means_g))
-    while len(kept) >= max(FEWEST_IN_COMMON, LEAST_IN_COMMON * len(means_g)):
-        onto, sizes, turn = np.linalg.svd(columns[kept], full_matrices=False)
-        values = (onto.sum(axis=0) / np.maximum(sizes, 1e-300)) @ turn
-        if sizes[-1] < LEAST_SPREAD * sizes[0] or np.any(values[:3] <= 0.0):
-            return None
-        centre = -values[3:] / (2.0 * values[:3])
-        radius = np.sqrt((1.0 + np.sum(values[:3] * centre**2)) / values[:3])
-        lengths = np.linalg.norm((means_g - centre) / radius, axis=1)
-        if rms(lengths[kept] - 1.0) < AGREE_G:
-            return lengths if np.all(np.abs(centre) < LARGEST_OFFSET_G) else None
-        left = columns[kept] @ values - 1.0
-        own = np.maximum(1.0 - np.sum(onto**2, axis=1), 1e-9)
-        kept = np.delete(kept, np.argmax(left**2 / own))
-    return None
 
 
 def _half_range(low: Floats, high: Floats, noise: Floats) -> Floats:
@@ -400,28 +387,6 @@ def _tiny(mean: Floats) -> Floats:
     """Return the (groups, n) smallest variances, for data without noise."""
     square = (mean * mean).reshape((-1, 3, *mean.shape[1:]))
     return RELATIVE**2 * (square[:, 0] + square[:, 1] + square[:, 2])
-
-
-def clipped(average: Floats, at_limit: Floats, step: Floats, mean: Floats) -> NDArray[np.bool_]:
-    """
-    Return which axes end at a limit while another axis varies by more than rounding.
-
-    `average` are (axes, n) variances, and `at_limit` the (3, n) share of samples that repeat the
-    extreme of their axis so far; `step` (2, n) and `mean` (axes, n) are as in `at_least`.
-
-    """
-    reading = mean[:3]
-    tiny = _tiny(reading)
-    least = at_least(np.zeros_like(reading), step, reading)
-    ends = (average[:3] <= tiny) | (at_limit > AT_LIMIT)
-    return np.asarray(ends & np.any(average[:3] > 2.0 * least, axis=0))
-
-
-def at_least_any(noise: Floats, scale: Floats) -> Floats:
-    """Return (axes, n) variances, with those of the reading raised to `STD_FLOOR_G`."""
-    found = noise.copy()
-    found[:3] = np.fmax(noise[:3], (STD_FLOOR_G * scale)**2)
-    return found
 
 
 _TWO_VALUES = 0.1128

@@ -280,9 +280,10 @@ def stretch(sums: Records, level: Floats, length: int, size: int, spacing: float
     white = white + _DIGITS * np.sum(np.square(cells[..., length - 1:]), axis=0)
     line = lines(cells, length)
     found = strength_of(line, spacing, white)
-    reading = Trend(found.slope[:, 0], *(part[0] for part in found[1:]))
     return Stretch(
-        reading, found.excess, variance, sliding(np.maximum, level[:3], inner), count,
-        sliding(np.add, sums['at_limit'].T, length) / count,
-        sliding(np.add, sums['repeats'], length) / np.maximum(count - length, 1.0),
-        cells[:, 0], np.sum(line.square, axis=(0, 1)) / length, np.sum(white, axis=(0, 1)))
+        trend=Trend(found.slope[:, 0], *(part[0] for part in found[1:])), excess=found.excess,
+        variance=variance, highest=sliding(np.maximum, level[:3], inner), samples=count,
+        at_limit=sliding(np.add, sums['at_limit'].T, length) / count,
+        same=sliding(np.add, sums['repeats'], length) / np.maximum(count - length, 1.0),
+        means=cells[:, 0], scatter=np.sum(line.square, axis=(0, 1)) / length,
+        white=np.sum(white, axis=(0, 1)))

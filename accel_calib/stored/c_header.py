@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .made import (
-    frame_words, Made, Options, polynomial, single, steady_at, steady_grid, temperature_range)
+    frame_words, Made, Options, polynomial, single, steady_context, steady_grid, temperature_range)
 from ..calibration import Calibration
 from ..effects import (
     CUBE, MONOMIALS, ODD_SQUARE, PRODUCT, REFERENCE_TEMPERATURE, SIZE, SQUARE, WAVE, ZONAL, ZONES)
@@ -118,7 +118,7 @@ def _header_of(calibration: Calibration) -> Header:
     middle, half = (low + high) / 2.0, max((high - low) / 2.0, 1e-3)
     count, units = 4 * _LARGEST_DEGREE, calibration.units
     nodes = np.cos(np.pi * (np.arange(count) + 0.5) / count)
-    here = steady_at(calibration, middle + half * nodes)
+    here = calibration.model.at(steady_context(calibration, middle + half * nodes))
     vec_v, mat_w, bend = (polynomial(nodes, values, 0.1 * _SMALL_G, _LARGEST_DEGREE)
                           for values in (np.broadcast_to(here.vec_v, (count, 3)),
                                          np.broadcast_to(here.mat_w, (count, 3, 3)),
@@ -152,6 +152,15 @@ def header(calibration: Calibration, options: Options) -> Made:
         raise InputError(f'the calibration has an own effect of the force ({own[0]}), which has '
                          'no code in C', 'refine without --also, or write this correction by hand')
     made, name = _header_of(calibration), name_of(calibration, options)
+    bends: list[list[dict[str, Any]]] = [[
+        {'polynomial': np.append(0.0, made.mat_w[1:, axis, column]), 'kind': 'force',
+         'axis': column} for column in range(3)] for axis in range(3)]
+    for k, (monomial, axis) in enumerate(zip(made.monomial.tolist(), made.axis.tolist())):
+        kind, first = max((each for each in _KINDS.items() if each[1] <= monomial),
+                          key=lambda each: each[1])
+        which, of = divmod(monomial - first, 3)
+        bends[axis].append({**(ZONES[which]._asdict() if kind == 'zone' else {}), 'kind': kind,
+                            'axis': of, 'which': which, 'polynomial': made.bend[:, k]})
     degrees = sorted({ZONES[(index - ZONAL) // 3].degree
                       for index in made.monomial.tolist() if index >= ZONAL})
     values = {
@@ -159,7 +168,8 @@ def header(calibration: Calibration, options: Options) -> Made:
         'N': made.inverse, 'R': made.turn, 'steps': made.steps, 'V': list(made.vec_v.T),
         'roots': bool(np.any(made.monomial >= WAVE)),
         'per_unit': 1.0 / made.per_g,
-        'bend': [_terms(made, axis) for axis in range(3)],
+        # What is taken from d of each axis: polynomials in s times a monomial.
+        'bend': [[each for each in terms if np.any(each['polynomial'])] for terms in bends],
         'legendre': [(degree, np.array(next(zone.polynomial for zone in ZONES
                                             if zone.degree == degree))) for degree in degrees],
         'unit': 'm/s^2' if calibration.units.is_si else 'g', 'frame': frame_words(calibration),
@@ -183,17 +193,3 @@ def identifier(text: str) -> str:
     parts = re.findall('[a-z0-9]+', text.lower())
     name = '_'.join(parts)[:40].rstrip('_')
     return name if name[:1].isalpha() else f'accel_{name}'.rstrip('_')
-
-
-def _terms(header: Header, axis: int) -> list[dict[str, Any]]:
-    """Return the terms that are taken from d of an axis: a polynomial in s times a monomial."""
-    found: list[dict[str, Any]] = [
-        {'polynomial': np.append(0.0, header.mat_w[1:, axis, column]), 'kind': 'force',
-         'axis': column} for column in range(3)]
-    for k in np.flatnonzero(header.axis == axis):
-        kind, first = max((each for each in _KINDS.items() if each[1] <= header.monomial[k]),
-                          key=lambda each: each[1])
-        which, of = divmod(int(header.monomial[k]) - first, 3)
-        found.append({**(ZONES[which]._asdict() if kind == 'zone' else {}), 'kind': kind,
-                      'axis': of, 'which': which, 'polynomial': header.bend[:, k]})
-    return [each for each in found if np.any(each['polynomial'])]

@@ -109,6 +109,7 @@ def calibration_bytes(calibration: Calibration) -> bytes:
 
 def _content(calibration: Calibration) -> dict[str, Any]:
     model, units, poses = calibration.model, calibration.units, calibration.poses
+    gyro, noise = calibration.gyro, calibration.noise
     return {
         'format': FORMAT, 'version': _VERSION, 'package_version': __version__,
         'equation': _EQUATION, 'sensor': calibration.sensor, 'stream': calibration.stream,
@@ -129,7 +130,16 @@ def _content(calibration: Calibration) -> dict[str, Any]:
                        'offset': calibration.offset.tolist()},
         'covariance': calibration.covariance[np.ix_(model.stated, model.stated)].tolist(),
         'quality': asdict(calibration.quality),
-        **_rest_noise(calibration.gyro, calibration.noise),
+        **({} if gyro is None else {'gyro_bias': {
+            'unit': 'rad/s, slope in rad/s/°C, temperatures in °C', 'bias': gyro.bias.tolist(),
+            'sd': gyro.sd.tolist(), 'slope': gyro.slope.tolist(),
+            'temperature': plain(float(gyro.temperature)),
+            'temperatures': [float(each) for each in gyro.temperatures],
+            'rests': int(gyro.rests)}}),
+        **({} if noise is None else {'noise': {
+            'what': 'standard deviation of one sample; force in the unit of the readings, rate in '
+                    'rad/s',
+            'force': plain(noise.force), 'rate': plain(noise.rate)}}),
         'rejected': [asdict(rejected) for rejected in calibration.rejected],
         'findings': [each.stated for each in without(calibration.noted, *OF_FILE)],
         'poses': {'row': poses.row.tolist(),
@@ -145,23 +155,6 @@ def _own_rms(calibration: Calibration, own: EffectKey) -> float:
     shape = entry_of(own).split(calibration.model.values[own])[1]
     poses_g = add_history(in_g(calibration.poses, calibration.units), calibration.model)
     return rms(factors_of(own, [shape], poses_g.columns))
-
-
-def _rest_noise(gyro: GyroBias | None, noise: SampleNoise | None) -> dict[str, Any]:
-    """Return the gyro bias and the noise of a sample, where they are known; null for NaN."""
-    content: dict[str, Any] = {}
-    if gyro is not None:
-        content['gyro_bias'] = {
-            'unit': 'rad/s, slope in rad/s/°C, temperatures in °C', 'bias': gyro.bias.tolist(),
-            'sd': gyro.sd.tolist(), 'slope': gyro.slope.tolist(),
-            'temperature': plain(float(gyro.temperature)),
-            'temperatures': [float(each) for each in gyro.temperatures], 'rests': int(gyro.rests)}
-    if noise is not None:
-        content['noise'] = {
-            'what': 'standard deviation of one sample; force in the unit of the readings, rate in '
-                    'rad/s',
-            'force': plain(noise.force), 'rate': plain(noise.rate)}
-    return content
 
 
 def calibration_from(data: bytes, name: str, own: Sequence[OwnEffect] = ()) -> Calibration:
@@ -205,9 +198,8 @@ def _checked(data: bytes, name: str, own: Sequence[OwnEffect]) -> Calibration:
         raise StoredCalibrationError(f'{name} has version {version}, expected {_VERSION}',
                                      'fit the poses again' if version < _VERSION else
                                      'update accel_calib, or fit the poses again')
-    _check_known(content, name, own)
     with np.errstate(all='ignore'):  # the checks refuse what is not finite
-        calibration = gated(_calibration(content, own))
+        calibration = gated(_calibration(content, name, own))
     for each, effect in zip(calibration.model.effects, calibration.model.terms.effects,
                             strict=True):
         if effect.own and not np.isclose(
@@ -222,17 +214,6 @@ def _checked(data: bytes, name: str, own: Sequence[OwnEffect]) -> Calibration:
     if digest.strip() != hashlib.sha256(body.rstrip().encode()).hexdigest():
         return _edited(calibration, content)
     return calibration
-
-
-def _check_known(content: Mapping[str, Any], name: str, own: Sequence[OwnEffect]) -> None:
-    """Refuse a calibration with an effect of the user that is not among `own`."""
-    stated, known = content.get('effects'), {each.name for each in own}
-    for each, values in stated.items() if isinstance(stated, Mapping) else ():
-        if isinstance(values, Mapping) and 'own_rms' in values and each not in known:
-            raise StoredCalibrationError(
-                f'{name} needs the effect {shown(each)} of the user ({shown(values.get("what"))}),'
-                ' expected its definition', 'use --also FILE.py with the file that defines it, '
-                'the parameter also of the node, or also=[effect] in Python')
 
 
 def _edited(calibration: Calibration, content: Mapping[str, Any]) -> Calibration:
@@ -259,11 +240,16 @@ def _edited(calibration: Calibration, content: Mapping[str, Any]) -> Calibration
     return replace(calibration, noted=tuple(noted))
 
 
-def _calibration(content: Mapping[str, Any], own: Sequence[OwnEffect]) -> Calibration:
-    model = Model(_effects(value_at(content, 'effects', dict), own),
+def _calibration(content: Mapping[str, Any], file: str, own: Sequence[OwnEffect]) -> Calibration:
+    model = Model(_effects(value_at(content, 'effects', dict), file, own),
                   array_at(content, 'rotation', (3, 3)))
-    units, size = _units(value_at(content, 'units', dict)), int(np.sum(model.stated))
-    stated: dict[str, Any] = value_at(content, 'quality', dict)
+    stated: dict[str, Any] = value_at(content, 'units', dict)
+    unit, per_g = choice_at(stated, 'readings', UNIT_NAMES), number_at(stated, 'per_g')
+    low, high = _PER_G[unit]
+    if not low <= per_g <= high:
+        expected = f'{low:g}' if low == high else f'{low:g} to {high:g}'
+        raise ValueError(f'per_g is {shown(per_g)}, expected {expected} for {unit}')
+    stated, size = value_at(content, 'quality', dict), int(np.sum(model.stated))
     quality: dict[str, Any] = {
         each.name: None if stated[each.name] is None and each.name in (
             'held_out_rms_mg', 'noise_floor_mg', 'chi2_per_dof') else number_at(stated, each.name)
@@ -273,8 +259,9 @@ def _calibration(content: Mapping[str, Any], own: Sequence[OwnEffect]) -> Calibr
                      for each in values_at(content, 'rejected', dict))
     return Calibration(
         name=choice_at(content, 'model', _NAMES),
-        method=choice_at(content, 'method', STORED_METHODS), model=model, units=units,
-        sensor=value_at(content, 'sensor', str), stream=value_at(content, 'stream', str),
+        method=choice_at(content, 'method', STORED_METHODS), model=model,
+        units=Units(unit, per_g), sensor=value_at(content, 'sensor', str),
+        stream=value_at(content, 'stream', str),
         frame=choice_at(content, 'frame', FRAMES), date=value_at(content, 'date', str),
         covariance=array_at(content, 'covariance', (size, size), finite=False, most=LARGEST),
         quality=Quality(**quality),
@@ -303,34 +290,35 @@ def _optional(content: Mapping[str, Any], key: str, make: Callable[[dict[str, An
     return None if content.get(key) is None else make(value_at(content, key, dict))
 
 
-def _units(stated: Mapping[str, Any]) -> Units:
-    name, per_g = choice_at(stated, 'readings', UNIT_NAMES), number_at(stated, 'per_g')
-    low, high = _PER_G[name]
-    if not low <= per_g <= high:
-        expected = f'{low:g}' if low == high else f'{low:g} to {high:g}'
-        raise ValueError(f'per_g is {shown(per_g)}, expected {expected} for {name}')
-    return Units(name, per_g)
+def _effects(stated: Mapping[str, Any], file: str, own: Sequence[OwnEffect]
+             ) -> dict[EffectKey, Floats]:
+    """
+    Return the values of effects; shape constants that are not stated are the usual ones.
 
+    An effect of the user that is not among `own` is refused.
 
-def _effects(stated: Mapping[str, Any], own: Sequence[OwnEffect]) -> dict[EffectKey, Floats]:
-    """Return the values of effects; shape constants that are not stated are the usual ones."""
-    keys = {}
+    """
+    known, found = {each.name for each in own}, dict[EffectKey, Floats]()
+    for name, values in stated.items():
+        if isinstance(values, Mapping) and 'own_rms' in values and name not in known:
+            raise StoredCalibrationError(
+                f'{file} needs the effect {shown(name)} of the user ({shown(values.get("what"))}),'
+                ' expected its definition', 'use --also FILE.py with the file that defines it, '
+                'the parameter also of the node, or also=[effect] in Python')
     for name in stated:
         try:
-            keys[name] = effect_named(name[:LONGEST_NAME + 1], own)
+            key = effect_named(name[:LONGEST_NAME + 1], own)
         except KeyError:
-            keys[name] = ''
-        if len(name) > LONGEST_NAME or keys[name] in ('', *CHANGES, *PROCESSES):
+            key = ''
+        if len(name) > LONGEST_NAME or key in ('', *CHANGES, *PROCESSES):
             raise ValueError(f'effect {shown(name)} is not in the catalogue')
-    found = dict[EffectKey, Floats]()
-    for name, key in keys.items():
         effect, values = entry_of(key), value_at(stated, name, dict)
         for part in values:
             if part not in (*effect.values, 'what', 'unit', *(('own_rms',) if effect.own else ())):
                 raise ValueError(f'the key {shown(part)} of an effect is not known, expected one '
                                  f'of {", ".join(effect.values)}')
-        known = {**dict(zip(effect.shape, effect.usual)), **values}
-        found[key] = np.array([number_at(known, part, LARGEST) for part in effect.values])
+        values = {**dict(zip(effect.shape, effect.usual)), **values}
+        found[key] = np.array([number_at(values, part, LARGEST) for part in effect.values])
     return found
 
 

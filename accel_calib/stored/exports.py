@@ -20,7 +20,7 @@ import io
 import json
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TextIO, TYPE_CHECKING
+from typing import TextIO, TYPE_CHECKING
 
 import numpy as np
 
@@ -55,39 +55,15 @@ _BY_AXIS = 'offset, gain of each axis, thermal offset'
 _OF_FILE = 'that of the [file](files.md#calibration)'
 
 
-def _json(calibration: Calibration) -> Made:
-    return Made({'content': _content(calibration)}, None, True, notes=_left_alone(calibration))
-
-
-def _npz(calibration: Calibration) -> Made:
-    """Return all values as a NumPy archive; texts and effects are arrays of text."""
-    content = _content(calibration)
-    effects = content.pop('effects')
-    arrays = {key: np.asarray(value) for key, value in content.items()
-              if not isinstance(value, Mapping)}
-    arrays['effects'] = np.asarray(json.dumps(effects, allow_nan=False))
-    for name, values in calibration.model.values.items():
-        arrays[f'effect.{name}'] = values
-    for key, limits in calibration.ranges.items():
-        arrays[f'range.{key}'] = np.array(limits)
-    file = io.BytesIO()
-    np.savez(file, **arrays)  # type: ignore[arg-type]
-    return Made({}, None, True, notes=_left_alone(calibration), data=file.getvalue())
-
-
-def _left_alone(calibration: Calibration) -> tuple[str, ...]:
-    """Return a note about readers that use matrix and offset alone."""
+def _whole(calibration: Calibration, as_arrays: bool = False) -> Made:
+    """Return all values, perhaps as a NumPy archive: texts and effects are arrays of text."""
+    quality, model = calibration.quality, calibration.model
     left = difference_mg(calibration, Made({}, lambda reading, temperature: (
         reading - calibration.offset) @ calibration.matrix.T @ calibration.rotation
         / calibration.force_per_g, True))
-    if left < LEAST_LOSS_MG:
-        return ()
-    return (f'matrix and offset without the other effects leave {left:.2g} mg',)
-
-
-def _content(calibration: Calibration) -> dict[str, Any]:
-    quality, model = calibration.quality, calibration.model
-    return {
+    notes = () if left < LEAST_LOSS_MG else (
+        f'matrix and offset without the other effects leave {left:.2g} mg',)
+    content = {
         'format': 'accel_calib export', 'package_version': __version__, 'equation': CORRECTION,
         'sensor': calibration.sensor, 'stream': calibration.stream, 'date': calibration.date,
         'units': calibration.units.name, 'per_g': calibration.units.per_g,
@@ -103,6 +79,16 @@ def _content(calibration: Calibration) -> dict[str, Any]:
                                                       strict=True)},
         'ranges': {key: list(limits) for key, limits in calibration.ranges.items()},
         'rms_before_mg': quality.rms_before_mg, 'rms_after_mg': quality.rms_after_mg}
+    if not as_arrays:
+        return Made({'content': content}, None, True, notes=notes)
+    arrays = {key: np.asarray(value) for key, value in content.items()
+              if not isinstance(value, Mapping)}
+    arrays['effects'] = np.asarray(json.dumps(content['effects'], allow_nan=False))
+    arrays |= {f'effect.{name}': values for name, values in model.values.items()}
+    arrays |= {f'range.{key}': np.array(each) for key, each in calibration.ranges.items()}
+    file = io.BytesIO()
+    np.savez(file, **arrays)  # type: ignore[arg-type]
+    return Made({}, None, True, notes=notes, data=file.getvalue())
 
 
 FORMATS: Mapping[str, Format] = MappingProxyType({
@@ -186,10 +172,10 @@ FORMATS: Mapping[str, Format] = MappingProxyType({
         needs='noise', source=_GITHUB + 'HKUST-Aerial-Robotics/VINS-Fusion/blob/master/'
         'vins_estimator/src/factor/integration_base.h'),
     'json': Format(
-        'JSON', '.json', 'all values', equation=_OF_FILE, holds='everything', make=_json),
+        'JSON', '.json', 'all values', equation=_OF_FILE, holds='everything', make=_whole),
     'npz': Format(
         'NumPy', '.npz', 'all values as arrays', equation=_OF_FILE, holds='everything',
-        make=_npz)})
+        make=partial(_whole, as_arrays=True))})
 """The formats by name."""
 
 CALIBRATION_ALONE = tuple(name for name, each in FORMATS.items() if each.needs != 'noise')

@@ -54,7 +54,7 @@ from numpy.polynomial import Polynomial
 
 from .c_header import name_of
 from .made import (
-    frame_words, Made, Options, plain_text, polynomial, single, steady_at, steady_grid,
+    frame_words, Made, Options, plain_text, polynomial, single, steady_context, steady_grid,
     temperature_range, unit_in_ascii)
 from .plain_yaml import beginning_of, decoded, shown
 from ..calibration import Calibration
@@ -99,7 +99,8 @@ def _fit_by_axis(calibration: Calibration, options: Options, reference: float | 
     reference = middle if reference is None else reference
     grid, degree = steady_grid(calibration), 0
     if high > low:
-        vec_v = np.broadcast_to(steady_at(calibration, np.linspace(low, high, 9)).vec_v, (9, 3))
+        context = steady_context(calibration, np.linspace(low, high, 9))
+        vec_v = np.broadcast_to(calibration.model.at(context).vec_v, (9, 3))
         degree = len(polynomial(np.linspace(-1.0, 1.0, 9), vec_v, _EXACT_G, DEGREE)) - 1
     s = (grid.temperature - middle) / half if degree else grid.temperature
     columns = np.vander(s, degree + 1, increasing=True)
@@ -300,41 +301,8 @@ Noise = Mapping[str, Any]
 
 
 def noise_alone(calibration: Calibration, noise: Noise | None, label: str) -> Made:
-    """Return the figures of a program that takes the readings as they are."""
-    figures, notes = _noise_figures(noise, label)
-    root = figures['update_rate'] ** 0.5
-    values = {
-        # The topic of most examples, if that of the readings is not known.
-        'topic': plain_text(calibration.stream) or '/imu0', 'units': _NOISE,
-        'gravity': calibration.units.per_g if calibration.units.is_si else STANDARD_GRAVITY,
-        'figures': _short(figures), 'sample': _short({
-            key: each * root for key, each in figures.items()})}
-    return Made(values, lambda reading, temperature: calibration.units.to_g(reading), False, notes,
-                ('the correction is not in this file: use accel-calib apply for recordings, or '
-                 'the calibrator node', *notes))
-
-
-def openvins(calibration: Calibration, noise: Noise | None) -> Made:
-    """Return the figures of the noise and the gains; OpenVINS estimates the offset itself."""
-    of_noise = noise_alone(calibration, noise, 'OpenVINS')
-    made = affine(calibration, levelled=False)
-    start = ', '.join(f'{each:.6g}' for each in made.values['V'])
-    advice = ('OpenVINS estimates the offset; estimator_config.yaml holds its start: '
-              f'init_dyn_bias_a: [{start}]')
-    return replace(
-        made, values={**of_noise.values, **made.values},
-        correct=lambda reading, temperature: (
-            calibration.units.to_g(reading) @ made.values['M'].T),
-        comment=(*made.comment, advice, *of_noise.comment), notes=(advice, *of_noise.comment))
-
-
-def _short(figures: Mapping[str, float]) -> dict[str, float]:
-    return {key: float(f'{value:.9g}') for key, value in figures.items()}
-
-
-def _noise_figures(noise: Noise | None, label: str) -> tuple[dict[str, float], tuple[str, ...]]:
     """
-    Return the figures of the noise that a file needs, and notes about them.
+    Return the figures of the noise for a program that takes the readings as they are.
 
     A random walk that is not seen in the recording is replaced by its upper limit. Other figures
     that are missing or not positive raise InputError.
@@ -360,7 +328,30 @@ def _noise_figures(noise: Noise | None, label: str) -> tuple[dict[str, float], t
                              'record a longer rest and run accel-calib noise again, or write the '
                              'figure of the data sheet into the file')
         figures[key] = value
-    return figures, tuple(notes)
+    of_figures, of_sample = ({key: float(f'{factor * each:.9g}') for key, each in figures.items()}
+                             for factor in (1.0, figures['update_rate'] ** 0.5))
+    values = {
+        # The topic of most examples, if that of the readings is not known.
+        'topic': plain_text(calibration.stream) or '/imu0', 'units': _NOISE,
+        'gravity': calibration.units.per_g if calibration.units.is_si else STANDARD_GRAVITY,
+        'figures': of_figures, 'sample': of_sample}
+    return Made(values, lambda reading, temperature: calibration.units.to_g(reading), False, notes,
+                ('the correction is not in this file: use accel-calib apply for recordings, or '
+                 'the calibrator node', *notes))
+
+
+def openvins(calibration: Calibration, noise: Noise | None) -> Made:
+    """Return the figures of the noise and the gains; OpenVINS estimates the offset itself."""
+    of_noise = noise_alone(calibration, noise, 'OpenVINS')
+    made = affine(calibration, levelled=False)
+    start = ', '.join(f'{each:.6g}' for each in made.values['V'])
+    advice = ('OpenVINS estimates the offset; estimator_config.yaml holds its start: '
+              f'init_dyn_bias_a: [{start}]')
+    return replace(
+        made, values={**of_noise.values, **made.values},
+        correct=lambda reading, temperature: (
+            calibration.units.to_g(reading) @ made.values['M'].T),
+        comment=(*made.comment, advice, *of_noise.comment), notes=(advice, *of_noise.comment))
 
 
 def _is_positive(value: object) -> TypeGuard[float]:

@@ -25,7 +25,7 @@ import numpy as np
 
 from ..calibration import Calibration, in_g, uncertainty_g
 from ..effects import (
-    add_history, AtContext, Context, EffectKey, entry_of, formula_of, Model, NOMINAL_SUPPLY,
+    add_history, Context, EffectKey, entry_of, formula_of, Model, NOMINAL_SUPPLY,
     REFERENCE_TEMPERATURE)
 from ..geometry import angle_of, OVER_THE_SPHERE, spread_directions
 from ..table import Floats, range_of
@@ -158,12 +158,8 @@ def temperature_range(calibration: Calibration) -> tuple[float, float] | None:
     return low, max(low, high)
 
 
-def steady_at(calibration: Calibration, temperature: Floats) -> AtContext:
-    """Return the steady model at (n,) temperatures."""
-    return calibration.model.at(_steady_context(calibration, temperature))
-
-
-def _steady_context(calibration: Calibration, temperature: Floats) -> Context:
+def steady_context(calibration: Calibration, temperature: Floats) -> Context:
+    """Return the context of the steady model at (n,) temperatures."""
     count, used = len(temperature), calibration.used_poses
     supply = (float(np.mean(used['supply_voltage'])) if 'supply_voltage' in used and len(used)
               else NOMINAL_SUPPLY)
@@ -181,7 +177,7 @@ def steady_grid(calibration: Calibration, temperatures: int = 9, size: float = 1
     levels = np.linspace(low, high, temperatures if high > low else 1)
     force = np.tile(OVER_THE_SPHERE * size, (len(levels), 1))
     temperature = np.repeat(levels, len(OVER_THE_SPHERE))
-    reading = steady_at(calibration, temperature).reading(force)
+    reading = calibration.model.at(steady_context(calibration, temperature)).reading(force)
     return Grid(calibration.units.from_g(reading), temperature, force)
 
 
@@ -212,9 +208,29 @@ def losses_of(calibration: Calibration, label: str, make: Callable[[Calibration]
     The part of an effect is the loss for a sensor that has this effect alone.
 
     """
-    found, total = [], difference_mg(calibration, made)
+    def left(values: dict[EffectKey, Floats]) -> float:
+        kept = Model(values)
+        alone = replace(calibration, model=kept, covariance=np.zeros((len(kept.vector),) * 2))
+        return difference_mg(alone, make(alone))
+
+    found, total = list[Loss](), difference_mg(calibration, made)
     if total >= LEAST_LOSS_MG:
-        found = sorted(_by_effect(calibration, label, make, made), key=lambda one: -one.leaves_mg)
+        ideal = left({})
+        found.append(Loss('', f'{label} has no sensitivity: leaves {ideal:.2g} mg', ideal))
+        for name, values in calibration.model.values.items():
+            part = float(np.sqrt(max(left({name: values}) ** 2 - ideal ** 2, 0.0)))
+            effect = entry_of(name)
+            parameters, shape = effect.split(values)
+            what = effect.words.partition(',')[0]
+            words = f'has no {what}'
+            if str(name) in made.rounded:
+                words = f'rounds the {what} to {made.rounded[str(name)]}'
+            elif effect.is_lagged(shape) and (
+                    left({name: effect.filled(parameters)}) < LEAST_LOSS_MG):
+                words = f'has no lag ({shape[0]:.0f} s) in the {what}'
+            found.append(Loss(str(name), f'{label} {words}: leaves {part:.2g} mg', part))
+        found = sorted((each for each in found if each.leaves_mg >= LEAST_LOSS_MG),
+                       key=lambda each: -each.leaves_mg)
         if len(found) != 1 or found[0].leaves_mg < 0.99 * total:
             limits = temperature_range(calibration)
             where = f', from {limits[0]:.0f} to {limits[1]:.0f} degC' if limits else ''
@@ -227,57 +243,29 @@ def losses_of(calibration: Calibration, label: str, make: Callable[[Calibration]
     return tuple(found)
 
 
-def _by_effect(calibration: Calibration, label: str, make: Callable[[Calibration], Made],
-               made: Made) -> list[Loss]:
-    """Return the losses of the effects, and of the sensitivity, where they matter."""
-    def left(values: dict[EffectKey, Floats]) -> float:
-        kept = Model(values)
-        alone = replace(calibration, model=kept, covariance=np.zeros((len(kept.vector),) * 2))
-        return difference_mg(alone, make(alone))
-
-    ideal = left({})
-    found = [Loss('', f'{label} has no sensitivity: leaves {ideal:.2g} mg', ideal)]
-    for name, values in calibration.model.values.items():
-        part = float(np.sqrt(max(left({name: values}) ** 2 - ideal ** 2, 0.0)))
-        effect = entry_of(name)
-        parameters, shape = effect.split(values)
-        what = effect.words.partition(',')[0]
-        words = f'has no {what}'
-        if str(name) in made.rounded:
-            words = f'rounds the {what} to {made.rounded[str(name)]}'
-        elif effect.is_lagged(shape) and left({name: effect.filled(parameters)}) < LEAST_LOSS_MG:
-            words = f'has no lag ({shape[0]:.0f} s) in the {what}'
-        found.append(Loss(str(name), f'{label} {words}: leaves {part:.2g} mg', part))
-    return [loss for loss in found if loss.leaves_mg >= LEAST_LOSS_MG]
-
-
 def difference_mg(calibration: Calibration, made: Made) -> float:
     """Return the RMS difference between the full correction and that of an export [mg]."""
     if made.correct is None:
         return 0.0
-    grid = _full_grid(calibration)
+    model = calibration.model
+    if not set(model.needs) - {'temperature'}:
+        grid = steady_grid(calibration)
+    else:  # forces over the sphere with the context of the poses
+        poses = add_history(in_g(calibration.poses, calibration.units), model)
+        known = calibration.held_context(poses.columns)
+        rows = np.flatnonzero(np.isin(calibration.poses.row, calibration.used_poses.row))
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, 60).astype(int))]
+        directions = spread_directions(100)
+        each = np.repeat(rows, len(directions))
+        context: dict[str, Any] = {
+            **steady_context(calibration, np.full(len(each), REFERENCE_TEMPERATURE)),
+            **{key: values[each] for key, values in known.items()}}
+        force = np.tile(directions, (len(rows), 1))
+        reading = model.at(context).reading(force)
+        grid = Grid(calibration.units.from_g(reading), context['temperature'], force)
     wanted = grid.force @ calibration.rotation if made.levelled else grid.force
     found = made.correct(grid.reading, grid.temperature)
     return float(np.sqrt(np.mean(np.sum((found - wanted) ** 2, axis=1)))) * MG
-
-
-def _full_grid(calibration: Calibration) -> Grid:
-    """Return forces over the sphere with the context of the poses."""
-    model = calibration.model
-    if not set(model.needs) - {'temperature'}:
-        return steady_grid(calibration)
-    poses = add_history(in_g(calibration.poses, calibration.units), model)
-    known = calibration.held_context(poses.columns)
-    rows = np.flatnonzero(np.isin(calibration.poses.row, calibration.used_poses.row))
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, 60).astype(int))]
-    directions = spread_directions(100)
-    each = np.repeat(rows, len(directions))
-    context: dict[str, Any] = {
-        **_steady_context(calibration, np.full(len(each), REFERENCE_TEMPERATURE)),
-        **{key: values[each] for key, values in known.items()}}
-    force = np.tile(directions, (len(rows), 1))
-    reading = model.at(context).reading(force)
-    return Grid(calibration.units.from_g(reading), context['temperature'], force)
 
 
 # Text
@@ -297,11 +285,16 @@ def unit_in_ascii(units: Units, native: str) -> str:
     return native if units.is_native else units.name.replace('s2', 's^2')
 
 
-def about(calibration: Calibration) -> list[str]:
-    """Return lines about a calibration for a comment: sensor, unit, model, curves, quality."""
+def rendered(name: str, chosen: Format, calibration: Calibration, made: Made) -> str:
+    """
+    Return the text of a file, from the template of this name.
+
+    Its comment has lines about the calibration: sensor, unit, model, quality, and curves.
+
+    """
     quality, poses, units = calibration.quality, calibration.used_poses, calibration.units
     effects = ', '.join(map(str, calibration.model.effects))
-    lines = [f'sensor: {calibration.sensor or "not named"}',
+    lines = [TITLE, f'sensor: {calibration.sensor or "not named"}',
              f'date: {calibration.date or "not known"}',
              f'readings: {unit_in_ascii(units, "native (counts or volts)")}, '
              f'1 g = {units.per_g:.9g}',
@@ -310,13 +303,18 @@ def about(calibration: Calibration) -> list[str]:
              f'{quality.rms_after_mg:.3g} mg',
              f'uncertainty of |force|: {uncertainty_g(calibration) * MG:.2g} mg (1 sd, largest '
              'over the sphere)']
-    for name, values in calibration.model.values.items():
-        formula = formula_of(name, values, calibration.deviations).replace('°C', 'degC')
+    for effect, values in calibration.model.values.items():
+        formula = formula_of(effect, values, calibration.deviations).replace('°C', 'degC')
         lines += [f'formula of {formula}'] if formula else []
     low, high = range_of(poses, 'temperature')
     if np.isfinite(low):
         lines.append(f'temperature of the poses: {low:.1f} to {high:.1f} degC')
-    return lines
+    if chosen.source:
+        lines += [f'source: {chosen.source}', f'equation: {chosen.equation}']
+    comment = [plain_text(part) for line in (*lines, *made.comment)
+               for part in wrap(line, _LARGEST_TEXT)]
+    template = _environment().get_template(f'{name}.j2')
+    return template.render({**plain(made.values), 'comment': comment})
 
 
 def frame_words(calibration: Calibration) -> str:
@@ -324,18 +322,6 @@ def frame_words(calibration: Calibration) -> str:
     if not calibration.is_levelled:
         return 'in the axes of the sensor'
     return f'in the levelled frame {calibration.frame}: {_AXES[calibration.frame]}'
-
-
-# The templates
-
-
-def rendered(name: str, chosen: Format, calibration: Calibration, made: Made) -> str:
-    """Return the text of a file, from the template of this name."""
-    of_reader = [f'source: {chosen.source}', f'equation: {chosen.equation}']
-    lines = [TITLE, *about(calibration), *(of_reader if chosen.source else ()), *made.comment]
-    comment = [plain_text(part) for line in lines for part in wrap(line, _LARGEST_TEXT)]
-    template = _environment().get_template(f'{name}.j2')
-    return template.render({**plain(made.values), 'comment': comment})
 
 
 @cache

@@ -18,6 +18,7 @@ another type.
 """
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 import math
 from pathlib import Path
 import re
@@ -85,8 +86,16 @@ def read_plain(text: str) -> Any:
     text is not YAML, is not plain, or exceeds a limit.
 
     """
+    content, reader = None, _Reader(yaml.parse(text, Loader=SafeLoader))
     try:
-        return _Reader(yaml.parse(text, Loader=SafeLoader)).content()
+        for event in reader.events:
+            if isinstance(event, yaml.DocumentStartEvent):
+                content = reader.value(next(reader.events), 0)
+                break
+        for event in reader.events:
+            if isinstance(event, yaml.DocumentStartEvent):
+                raise reader.refusal(event, 'a second document starts, expected one')
+        return content
     except yaml.YAMLError as error:
         mark, problem = getattr(error, 'problem_mark', None), getattr(error, 'problem', None)
         where = '' if mark is None else f' in line {mark.line + 1}'
@@ -94,62 +103,51 @@ def read_plain(text: str) -> Any:
         raise ValueError(f'it is not YAML{where}: {words}') from error
 
 
+@dataclass
 class _Reader:
+    """The events of a text, the keys of the present value, and the number of values so far."""
 
-    def __init__(self, events: Iterator[yaml.Event]) -> None:
-        self._events = events
-        self._keys: list[str] = []
-        self._count = 0
+    events: Iterator[yaml.Event]
+    keys: list[str] = field(default_factory=list)
+    count: int = 0
 
-    def content(self) -> Any:
-        """Return the content of the only document."""
-        content = None
-        for event in self._events:
-            if isinstance(event, yaml.DocumentStartEvent):
-                content = self._value(next(self._events), 0)
-                break
-        for event in self._events:
-            if isinstance(event, yaml.DocumentStartEvent):
-                raise self._refusal(event, 'a second document starts, expected one')
-        return content
-
-    def _value(self, event: yaml.Event, depth: int) -> Any:
+    def value(self, event: yaml.Event, depth: int) -> Any:
         """Return the value that starts with an event below this number of levels."""
         self._check(event)
         if isinstance(event, yaml.ScalarEvent):
             return self._scalar(event) if event.implicit[0] else one_line(event.value)
         if depth == MOST_DEPTH:
-            raise self._refusal(event, f'it has more than {MOST_DEPTH} levels')
+            raise self.refusal(event, f'it has more than {MOST_DEPTH} levels')
         if not isinstance(event, yaml.MappingStartEvent):
             items = []
-            while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
-                items.append(self._value(event, depth + 1))
+            while not isinstance(event := next(self.events), yaml.SequenceEndEvent):
+                items.append(self.value(event, depth + 1))
             return items
         content: dict[str, Any] = {}
-        while not isinstance(event := next(self._events), yaml.MappingEndEvent):
+        while not isinstance(event := next(self.events), yaml.MappingEndEvent):
             self._check(event)
             if not isinstance(event, yaml.ScalarEvent):
-                raise self._refusal(event, 'a key is a mapping or a list, expected a name')
+                raise self.refusal(event, 'a key is a mapping or a list, expected a name')
             key = one_line(event.value)
             if key in content:
-                raise self._refusal(event, f'the key {shown(key)} is stated twice, expected once')
-            self._keys.append(key)
-            content[key] = self._value(next(self._events), depth + 1)
-            self._keys.pop()
+                raise self.refusal(event, f'the key {shown(key)} is stated twice, expected once')
+            self.keys.append(key)
+            content[key] = self.value(next(self.events), depth + 1)
+            self.keys.pop()
         return content
 
     def _check(self, event: yaml.Event) -> None:
         """Refuse aliases, anchors, tags, and too many values."""
-        self._count += 1
+        self.count += 1
         if isinstance(event, yaml.AliasEvent):
-            raise self._refusal(event, f'there is the alias {shown(event.anchor)}, expected the '
-                                'value itself')
+            raise self.refusal(event, f'there is the alias {shown(event.anchor)}, expected the '
+                               'value itself')
         for mark in ('anchor', 'tag'):
             if getattr(event, mark) is not None:
-                raise self._refusal(event, f'there is the {mark} {shown(getattr(event, mark))}, '
-                                    'expected none')
-        if self._count > MOST_VALUES:
-            raise self._refusal(event, f'it has more than {MOST_VALUES} values')
+                raise self.refusal(event, f'there is the {mark} {shown(getattr(event, mark))}, '
+                                   'expected none')
+        if self.count > MOST_VALUES:
+            raise self.refusal(event, f'it has more than {MOST_VALUES} values')
 
     def _scalar(self, event: yaml.ScalarEvent) -> Any:
         """Return the value of unquoted text; refuse dates and numbers that are not decimal."""
@@ -166,15 +164,15 @@ class _Reader:
         if kind == 'float' and _NOT_FINITE.fullmatch(text):
             return float(text.replace('.', ''))
         if kind in ('float', 'int', 'timestamp'):
-            raise self._refusal(event, f'the value is {shown(text)}, expected a decimal number, '
-                                'or text in quotes')
+            raise self.refusal(event, f'the value is {shown(text)}, expected a decimal number, '
+                               'or text in quotes')
         if kind == 'bool':
             return SafeLoader.bool_values[text.lower()]
         return None if kind == 'null' else one_line(text)
 
-    def _refusal(self, event: yaml.Event, words: str) -> ValueError:
+    def refusal(self, event: yaml.Event, words: str) -> ValueError:
         """Return the error for an event, with its key and line."""
-        path = '.'.join(shown(key)[1:-1] for key in self._keys if key)
+        path = '.'.join(shown(key)[1:-1] for key in self.keys if key)
         line = 1 + (event.start_mark.line if event.start_mark is not None else 0)
         return ValueError(f'{f"at {path}, line" if path else "in line"} {line}, {words}')
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from accel_calib.stored import read_calibration
 from faults.trials import command, COMMANDS, ERRORS, FEW, KINDS, TASKS
-from inside import Identity, SensorStore
+from inside import SensorStore
 import pytest
 
 HERE = Path(__file__).parent
@@ -32,7 +32,7 @@ def fill(folder: Path) -> None:
             for task in COMMANDS:
                 assert COMMANDS[task](folder) == 0
     run('fit', folder / 'poses.csv', '-o', folder / 'imu.yaml', '--sensor', 'imu')
-    store = SensorStore(folder / 'imu.yaml', Identity('imu', '/imu'), 'm/s2')
+    store = SensorStore(folder / 'imu.yaml', 'imu', '/imu', 'm/s2')
     store.write(store.prepared(read_calibration(folder / 'new.yaml')))
     store.write(store.prepared(read_calibration(folder / 'imu.yaml.before1')))
 

@@ -25,7 +25,7 @@ from typing import Any
 
 from accel_calib.stored import read_calibration
 from faults.sample import FACTOR, sample
-from inside import Identity, main as command, SensorStore
+from inside import main as command, SensorStore
 
 KINDS = {'kill': (1, 0), 'torn': (2, 0), 'eio': (3, errno.EIO), 'enospc': (3, errno.ENOSPC)}
 ERRORS = ('eio', 'enospc')
@@ -44,7 +44,7 @@ def _command(*arguments: str) -> Callable[[Path], int]:
 
 
 def _store(folder: Path) -> SensorStore:
-    return SensorStore(folder / 'imu.yaml', Identity('imu', '/imu'), 'm/s2')
+    return SensorStore(folder / 'imu.yaml', 'imu', '/imu', 'm/s2')
 
 
 def _save(folder: Path) -> int:
