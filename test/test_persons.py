@@ -13,7 +13,7 @@ import signal
 from typing import Any
 
 from accel_calib.errors import InputError, RefusedFitError
-from accel_calib.session import COMMANDS, conditions, enable, next_step, state, Surroundings
+from accel_calib.session import BUTTONS, conditions, enable, next_step, state, Surroundings
 from driven import Driver, GRAVITY, Person
 from inside import spread_directions
 import numpy as np
@@ -98,7 +98,7 @@ def test_every_person_ends_in_a_calibration_or_in_one_named_reason(
     case, driver = PERSONS[name], Driver()
     case.change(driver)
     for command in case.refuses:
-        monkeypatch.setitem(COMMANDS, command, refused)
+        monkeypatch.setitem(BUTTONS, command, refused)
     person = Person(driver, case.sensor, **case.about)
     assert person.follow(seconds=case.seconds) == case.ends, person.steps
     driver.tick()
@@ -117,8 +117,7 @@ def test_every_person_ends_in_a_calibration_or_in_one_named_reason(
     assert len(person.called) == len(set(person.called)) or case.ends == 'done'
 
 
-def test_axes_of_a_driver_are_named_after_two_rests_and_poses_are_asked_for_as_they_read(
-        ) -> None:
+def test_axes_of_a_driver_are_named_after_two_rests_and_poses_are_asked_for_as_they_read() -> None:
     for axes, words in ((INVERTED, 'the z axis of the readings is probably inverted'),
                         (SWAPPED, '+x reads +y, +y reads +x')):
         driver = Driver(sensor=words[4:9])
@@ -375,8 +374,7 @@ def test_an_upside_down_sensor_is_asked_about_once_unless_its_mounting_is_given(
 
 def test_an_effect_far_beyond_those_of_parts_is_reported_and_not_used() -> None:
     driver = Driver()
-    driver.session.change(surroundings=Surroundings(
-        thermometers=('/board/temperature', '/cpu')))
+    driver.session.change(surroundings=Surroundings(thermometers=('/board/temperature', '/cpu')))
 
     def unseen(up: Any, temperature: float) -> Any:
         return healthy(up, temperature) + 3.0 * EFFECT * (temperature - 25.0)
