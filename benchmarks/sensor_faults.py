@@ -26,7 +26,7 @@ from accel_calib.findings import Rating
 from accel_calib.geometry import spread_directions, unit
 from accel_calib.logs import LogOptions, open_log
 from accel_calib.pipeline import calibrated_log, Outcome, poses_of
-from accel_calib.session import checks, columns_of
+from accel_calib.session import columns_of, diagnostics
 from accel_calib.statistics import rms
 from accel_calib.table import concatenated, Floats
 from bag_files import fill, header, IMU, imu, writer_of
@@ -184,7 +184,7 @@ def calibrate_session(log: Log, units: str, found: tuple[Finding, ...]) -> Said:
         rating = driver.sensor.rating
         said = ' '.join([answer, *(line.words for line in driver.log),
                          *(each.words for each in (rating.findings if rating else ())),
-                         *(str(each) for each in checks(driver.session.state))])
+                         *(str(each) for each in diagnostics(driver.session.state)[1:])])
         return said, driver.calibration, rating
 
 

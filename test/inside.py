@@ -88,7 +88,6 @@ from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store, worker
 from accel_calib.session.commands import poses_changed
 from accel_calib.session.conditions import step_of
-from accel_calib.session.fitting import fit as fit_in_node
 from accel_calib.session.live_capture import LiveCapture, with_temperature
 from accel_calib.session.pose_guide import Guide
 from accel_calib.session.sensor import new_sensor, rest_after
@@ -97,7 +96,7 @@ from accel_calib.session.state import figures
 from accel_calib.session.store import (
     aside, MOST_STEPS, SensorFiles, Store as SensorStore, store_of, writing_advice)
 from accel_calib.session.stream import StreamStatistics, TemperatureHistory
-from accel_calib.session.use import adopt as use_calibration
+from accel_calib.session.use import adopt as use_calibration, fit as fit_in_node
 from accel_calib.session.worker import Worker, WorkerProcess
 from accel_calib.stillness import rounding_left
 from accel_calib.stillness.chunks import repeated_extremes

@@ -292,15 +292,25 @@ class Calibration(Record):
     @property
     def offset_sd(self) -> Floats:
         """Return the standard deviation of V, (3,), in the unit of the readings."""
-        rows = _linear_rows(self.model, np.zeros((1, 3)))[0]
-        return self.units.from_g(_deviation(rows, self.covariance))
+        return self.units.from_g(self._linear_sd[:, 0])
 
     @property
     def gain_sd(self) -> Floats:
         """Return the standard deviation of W, (3, 3)."""
-        rows = _linear_rows(self.model, np.vstack([np.zeros(3), np.eye(3)]))
-        columns = [_deviation(row - rows[0], self.covariance) for row in rows[1:]]
-        return np.column_stack(columns) * (self.units.per_g / self.force_per_g)
+        return self._linear_sd[:, 1:] * (self.units.per_g / self.force_per_g)
+
+    @property
+    def _linear_sd(self) -> Floats:
+        """(3, 4) array, standard deviation of V [g] and of the columns of W."""
+        model, effects = self.model, self.model.terms.effects
+        linear = Model({name: values for (name, values), effect in
+                        zip(model.values.items(), effects, strict=True) if effect.linear})
+        place = np.isin(self.parameters, parameter_names(linear.effects))
+        # The derivative of V + W u at the origin, and of its change along each axis.
+        basis = linear.basis(np.vstack([np.zeros(3), np.eye(3)]), {}).full
+        rows = np.concatenate([basis[:1], basis[1:] - basis[0]])
+        covariance = self.covariance[np.ix_(place, place)]
+        return np.sqrt(np.maximum(np.einsum('kip,pq,kiq->ik', rows, covariance, rows), 0.0))
 
     @cached_property
     def used_poses(self) -> Poses:
@@ -531,18 +541,3 @@ def check_sensor(calibration: Calibration, sensor: str) -> None:
         raise StoredCalibrationError(f'the calibration belongs to sensor {calibration.sensor!r}, '
                                      f'but the readings come from {sensor!r}',
                                      'use the calibration of this sensor, or fit one')
-
-
-def _linear_rows(model: Model, u: Floats) -> Floats:
-    """Return the (n, 3, p) derivative of V + W u by each value; 0 for values outside V and W."""
-    linear = Model({name: values for (name, values), effect in
-                    zip(model.values.items(), model.terms.effects, strict=True) if effect.linear})
-    rows = np.zeros((len(u), 3, len(model.vector)))
-    place = np.isin(parameter_names(model.effects), parameter_names(linear.effects))
-    rows[:, :, place] = linear.basis(u, {}).full
-    return rows
-
-
-def _deviation(rows: Floats, covariance: Floats) -> Floats:
-    """Return the standard deviation of each of these (m, p) combinations of values."""
-    return np.sqrt(np.maximum(np.einsum('ip,pq,iq->i', rows, covariance, rows), 0.0))

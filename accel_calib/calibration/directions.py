@@ -25,13 +25,13 @@ determined. They are described by as few parameters as possible.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 import scipy
 
 from .calibration import Calibration
-from ..effects import EFFECTS, MODELS, parameter_names, with_vector
+from ..effects import Model, MODELS, parameter_names, with_vector
 from ..estimate import fit_sphere
 from ..geometry import cone_of, distinct, OVER_THE_SPHERE, unit
 from ..table import Floats, Poses
@@ -81,15 +81,17 @@ _WIDE = 75.0
 """Angle above which poses are no longer described as near one direction [°]."""
 
 
-def effects_of(name: str) -> tuple[str, ...]:
-    """Return the effects of a model; model 9 is model 10 in other axes."""
+@cache
+def ideal_of(name: str) -> Model:
+    """Return the model without errors; model 9 is model 10 in other axes."""
     form = MODELS[name]
-    return MODELS[form.norm].effects if form.sensing_axes else form.effects
+    effects = MODELS[form.norm].effects if form.sensing_axes else form.effects
+    return with_vector(effects, np.zeros(len(parameter_names(effects))))
 
 
 def free_parameters(name: str) -> int:
     """Return the number of free parameters of a model: 4, 6 (g is known), 9, 9 or 12."""
-    return len(parameter_names(effects_of(name)))
+    return len(ideal_of(name).vector)
 
 
 def poses_needed(name: str) -> int:
@@ -99,12 +101,11 @@ def poses_needed(name: str) -> int:
 
 def rows_of(name: str, directions: Floats) -> Floats:
     """Return Φ at (n, 3) unit vectors: (n, 1, p), or (n, 3, p) for model 12."""
-    ideal = with_vector(effects_of(name), np.zeros(free_parameters(name)))
-    basis = ideal.basis(directions, {})
+    basis = ideal_of(name).basis(directions, {})
     return basis.full if MODELS[name].known_orientation else basis.along(directions)[:, np.newaxis]
 
 
-@lru_cache(maxsize=8)
+@cache
 def _over_the_sphere(name: str) -> Floats:
     """Return the (m, 1 or 3, p) rows Φ at directions spread evenly over the sphere."""
     return rows_of(name, OVER_THE_SPHERE)
@@ -193,16 +194,18 @@ def identifiability(name: str, directions: Floats, noise: Floats | None = None) 
     n can be 0. `noise` is (n,), of each pose, in any unit; by default it is equal for all poses.
 
     """
-    names = parameter_names(effects_of(name))
+    names = parameter_names(ideal_of(name).effects)
     triangle = np.linalg.qr(_weighted_rows(name, directions, noise), mode='r')
     square = np.zeros((len(names), len(names)))
     square[:len(triangle)] = triangle
     _, scales, axes = np.linalg.svd(square)  # combinations as rows, the best determined first
     determined = scales > _SINGULAR * max(scales[0], 1.0)
     deviations = np.where(determined, 1.0 / np.where(determined, scales, 1.0), np.inf)
-    each = np.sqrt(np.sum(_times(axes.T ** 2, deviations ** 2), axis=1))
-    seen = np.sum((_over_the_sphere(name) @ axes.T) ** 2, axis=1)
-    errors = np.cumsum(_times(seen, deviations ** 2), axis=1)  # from all up to this one
+    share = np.vstack([axes.T ** 2, np.sum((_over_the_sphere(name) @ axes.T) ** 2, axis=1)])
+    none = share < _NOTHING  # 0 times an infinite deviation is 0
+    parts = np.where(none, 0.0, share) * np.where(none, 0.0, deviations ** 2)
+    each = np.sqrt(np.sum(parts[:len(names)], axis=1))
+    errors = np.cumsum(parts[len(names):], axis=1)  # from all up to this one
     open_, found = axes[np.sqrt(np.max(errors, axis=0)) > LARGEST_DILUTION], []
     if len(open_):  # as sparse combinations with the same span, each with its own pivot
         pivots = scipy.linalg.qr(open_, mode='r', pivoting=True)[1][:len(open_)]
@@ -214,12 +217,6 @@ def identifiability(name: str, directions: Floats, noise: Floats | None = None) 
     return Identifiability(name, dict(zip(names, map(float, each), strict=True)), tuple(found),
                            float(np.sqrt(np.max(errors[:, -1]))),
                            float(np.sqrt(np.mean(errors[:, -1]))))
-
-
-def _times(share: Floats, deviations: Floats) -> Floats:
-    """Return the product; 0 times an infinite deviation is 0."""
-    none = np.abs(share) < _NOTHING
-    return np.where(none, 0.0, share) * np.where(none, 0.0, deviations)
 
 
 def determines(name: str, directions: Floats, noise: Floats | None = None) -> bool:
@@ -238,18 +235,13 @@ def error_left_in(smaller: str, larger: str, directions: Floats, noise: Floats |
     unknown orientation; directions and noise as in `identifiability`.
 
     """
-    effects = [effect for effect in left_out(smaller, larger) for _ in EFFECTS[effect].values]
-    more = [name.partition('.')[0] in effects for name in parameter_names(effects_of(larger))]
+    small, large = ideal_of(smaller), ideal_of(larger)
+    more = ~np.isin(parameter_names(large.effects), parameter_names(small.effects))
+    sizes = np.array([each.typical for each in large.terms.effects for _ in each.values])[more]
     added = np.linalg.lstsq(_weighted_rows(smaller, directions, noise),
                             _weighted_rows(larger, directions, noise)[:, more], rcond=None)[0]
     wrong = _over_the_sphere(larger)[:, 0, more] - _over_the_sphere(smaller)[:, 0] @ added
-    sizes = np.array([EFFECTS[effect].typical for effect in effects])
     return float(np.sqrt(np.sum(np.mean(wrong ** 2, axis=0) * sizes ** 2)))
-
-
-def left_out(smaller: str, larger: str) -> list[str]:
-    """Return the effects that a smaller model omits."""
-    return [effect for effect in effects_of(larger) if effect not in effects_of(smaller)]
 
 
 def directions_of(poses: Poses, units: Units) -> Floats:

@@ -39,9 +39,9 @@ from .quality import finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, 
 from ..effects import EFFECTS, length_rows, linear_model, Model, MODELS, sensor_force, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
-    closed_form, covariance_with, estimate, faces, Fit, fit_12, fit_norm, fit_sphere, judge,
-    lower_triangular, NotConvergedError, originals, outliers, outliers_or_scatter, Point,
-    pose_noise, rivals, solve, start_of, stated, TIES, with_scatter_of)
+    closed_form, covariance_with, estimate, faces, Fit, fit_12, fit_robust, fit_sphere, judge,
+    NotConvergedError, originals, Point, pose_noise, rivals, solve, start_of, stated, TIES,
+    with_scatter_of)
 from ..finding import explained_by, Finding
 from ..geometry import unit
 from ..statistics import rms
@@ -109,11 +109,19 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
     if rejected and method == 'algebraic':
         raise RefusedFitError(f'row {rejected[0].row}: {rejected[0].reason}, but the method '
                               'algebraic uses every row', 'remove the row, or use the method ml')
-    inside, ended, limited = inside_rows(sound, units) if method == 'ml' else (sound, (), ())
+    limited: tuple[Finding, ...] = ()
+    if method == 'ml' and 'at_limit' in sound and np.any(ended := sound['at_limit'] > 0.0):
+        rows = tuple(sound.row[ended].tolist())
+        limit = float(np.max(np.abs(sound.reading[ended])))
+        limited = (Finding(
+            'limited', f'{len(rows)} of {len(sound)} poses are left out, because the readings end '
+            f'at {short(limit)} {units.name}, the limit of the sensor', 'choose a larger range of '
+            'the sensor, and record again', 'USABLE', rows, step='record'),)
+        sound = sound.take(~ended)
+        rejected += tuple(Rejected(row, CLIPPED, 'clipped') for row in rows)
     with explained_by(limited):
-        calibration, doubts = _without_doubtful(inside, units, model, method)
-        left_out = sorted((*rejected, *ended, *doubts, *calibration.rejected),
-                          key=lambda pose: pose.row)
+        calibration, doubts = _without_doubtful(sound, units, model, method)
+        left_out = sorted((*rejected, *doubts, *calibration.rejected), key=lambda pose: pose.row)
         # The fitted table has references that the input may lack.
         every = calibration.poses if len(calibration.poses) == len(poses) else poses
         return finished(replace(
@@ -177,21 +185,6 @@ def sound_rows(poses: Poses, units: Units) -> tuple[Poses, tuple[Rejected, ...]]
     return sound, tuple(rejected)
 
 
-def inside_rows(poses: Poses, units: Units
-                ) -> tuple[Poses, tuple[Rejected, ...], tuple[Finding, ...]]:
-    """Separate poses from those that the capture marked as at the limit of the sensor."""
-    ended = poses['at_limit'] > 0.0 if 'at_limit' in poses else np.zeros(len(poses), bool)
-    if not np.any(ended):
-        return poses, (), ()
-    rows = tuple(poses.row[ended].tolist())
-    limit = float(np.max(np.abs(poses.reading[ended])))
-    return poses.take(~ended), tuple(
-        Rejected(row, CLIPPED, 'clipped') for row in rows), (Finding(
-            'limited', f'{len(rows)} of {len(poses)} poses are left out, because the readings end '
-            f'at {short(limit)} {units.name}, the limit of the sensor', 'choose a larger range of '
-            'the sensor, and record again', 'USABLE', rows, step='record'),)
-
-
 def sure_rows(poses: Poses) -> tuple[Poses, tuple[Rejected, ...]]:
     """Separate poses from those that the capture marked as doubtful."""
     if 'doubtful' not in poses or not np.any(poses['doubtful']):
@@ -222,8 +215,13 @@ def fit_unknown(poses: Poses, units: Units, model: str, method: Method
     fits: dict[str, Fit] = {}
     if method == 'ml':
         largest = list(dilutions)[-1]
-        fits[largest], among = _fit_norm(largest, poses_g.take(kept))
-        kept = kept[among]
+        try:
+            robust, among = fit_robust(MODELS[largest].norm, poses_g.take(kept))
+        except NotConvergedError:
+            raise RefusedFitError(
+                f'the {len(kept)} poses are not on an ellipsoid, but model {largest} needs one',
+                f'{TAKE_ALL_SIDES}, and hold it still in each') from None
+        fits[largest], kept = _in_own_axes(largest, robust), kept[among]
         poses_g = with_scatter_of(fits[largest], poses_g)
     left, used = poses_g.take(kept), directions[kept]
     noise = pose_noise(left.noise, used)
@@ -231,9 +229,7 @@ def fit_unknown(poses: Poses, units: Units, model: str, method: Method
         dilutions = _dilutions(model, used, noise)
     fits = {name: fits.get(name) or _fit_rows(left, name, method) for name in dilutions}
     name, reason = (model, f'model {model} was requested') if model != 'auto' else _choose(fits)
-    inside = np.zeros(len(poses_g), bool)
-    inside[kept] = True
-    fit, out = fits[name], first[~inside[first]]
+    fit, out = fits[name], np.setdiff1d(first, kept)
     unlike = rivals(fit, kept, out, poses_g, lambda others: _fit_rows(others, name, method))
     fit = stated(fit)
     noted = [*copies(original, poses_g), *rival_findings(unlike, poses_g.row),
@@ -241,9 +237,8 @@ def fit_unknown(poses: Poses, units: Units, model: str, method: Method
     if model == 'auto':
         noted += find_undetermined(list(dilutions)[-1], used, noise)
     return record_of(
-        fit, poses, units, used, name=name, method=method,
-        covariance=covariance_with(fit, unlike),
-        rejected=rejected_by(fit.model, poses_g.take(~inside[original])), reason=reason,
+        fit, poses, units, used, name=name, method=method, covariance=covariance_with(fit, unlike),
+        rejected=rejected_by(fit.model, poses_g.take(~np.isin(original, kept))), reason=reason,
         noted=tuple(noted)), fit
 
 
@@ -268,23 +263,11 @@ def only_norm(poses_g: Poses) -> Poses:
 def _dilutions(model: str, directions: Floats, noise: Floats | None) -> dict[str, float]:
     """Return the dilution of each candidate model that the poses determine, smallest first."""
     names = NORM_MODELS if model == 'auto' else (model,)
-    dilutions = {name: dilution(name, directions, noise) for name in names
-                 if len(directions) >= poses_needed(name)}
-    determined = {name: each for name, each in dilutions.items() if each <= LARGEST_DILUTION}
-    if names[0] not in determined:
+    found = {name: dilution(name, directions, noise) for name in names
+             if len(directions) >= poses_needed(name)}
+    if found.get(names[0], np.inf) > LARGEST_DILUTION:
         refuse_if_unfit(names[0], directions, noise)
-    return determined
-
-
-def _fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
-    """Fit a model without the outliers; model 9 in its own axes."""
-    try:
-        fit, kept = fit_norm(MODELS[name].norm, poses_g)
-    except NotConvergedError:
-        raise RefusedFitError(
-            f'the {len(poses_g)} poses are not on an ellipsoid, but model {name} needs one',
-            f'{TAKE_ALL_SIDES}, and hold it still in each') from None
-    return _in_own_axes(name, fit), kept
+    return {name: each for name, each in found.items() if each <= LARGEST_DILUTION}
 
 
 def _in_own_axes(name: str, fit: Fit) -> Fit:
@@ -292,7 +275,8 @@ def _in_own_axes(name: str, fit: Fit) -> Fit:
     if not MODELS[name].sensing_axes:
         return fit
     mat_w, vec_v = fit.model.linear_part
-    return judge(linear_model('9', lower_triangular(mat_w), vec_v), fit.poses_g, TIES)
+    lower_triangular = np.linalg.cholesky(mat_w @ mat_w.T)
+    return judge(linear_model('9', lower_triangular, vec_v), fit.poses_g, TIES)
 
 
 def _fit_rows(poses_g: Poses, name: str, method: Method) -> Fit:
@@ -370,10 +354,11 @@ def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
     refuse_if_unfit(ORIENTED, unit(poses['reference']))
     poses_g, everyone = in_g(poses, units), np.arange(len(poses))
     if method == 'algebraic':
-        plain = {key: poses_g[key] for key in ('reading', 'reference')}
-        fit, kept = _fit_oriented(Poses(plain, poses_g.row)), everyone
+        plain = Poses({key: poses_g[key] for key in ('reading', 'reference')}, poses_g.row)
+        fit, kept = estimate(start_of(ORIENTED, plain.reading), plain), everyone
     else:
-        fit, kept = outliers_or_scatter(poses_g, _without_outliers, _fit_oriented)
+        fit, kept = fit_robust(ORIENTED, poses_g, lambda left: determines(
+            ORIENTED, unit(left['reference'])))
     poses_g = with_scatter_of(fit, poses_g)
     out = np.delete(everyone, kept)
     unlike = rivals(fit, kept, out, poses_g, lambda others: estimate(fit.model, others))
@@ -383,27 +368,18 @@ def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
     rejected = tuple(
         Rejected(int(row), f'outlier: the reading differs by {error:.2f} mg from the fit of the '
                  'other poses', 'outlier') for row, error in zip(poses_g.row[out], away))
+    noted = [*rival_findings(unlike, poses.row), *fit_findings(fit, 0.0)]
+    off = fit.equations.of_poses(fit.residual)
+    angle = np.degrees(np.sqrt(3.0 * np.sum(off ** 2) / max(fit.dof, 1)))
+    if fit.dof > 0 and angle >= _WARN_DEGREES and fit.chi2 >= _WARN_CHI2 * fit.dof:
+        noted.append(Finding(
+            'placement', f'the readings differ by {angle:.2g}° from the known orientations: if '
+            'the placement of the sensor is not more accurate, the result has this error',
+            'take 12 or more poses in other orientations, too, and fit model 10'))
     return record_of(
         fit, poses, units, unit(fit.poses_g['reference']), name=ORIENTED, method=method,
-        covariance=covariance_with(fit, unlike), rejected=rejected,
-        reason=reason,
-        noted=(*rival_findings(unlike, poses.row), *fit_findings(fit, 0.0), *_placement(fit)))
-
-
-def _fit_oriented(poses_g: Poses) -> Fit:
-    """Fit model 12."""
-    return estimate(with_vector(MODELS[ORIENTED].effects, np.zeros(12)), poses_g)
-
-
-def _without_outliers(poses_g: Poses) -> tuple[Fit, Indices]:
-    """Fit model 12 without the outliers, if the other poses determine it."""
-    fit, kept = _fit_oriented(poses_g), np.arange(len(poses_g))
-    while len(out := outliers(fit, len(poses_g))):
-        left = np.delete(kept, out)
-        if not determines(ORIENTED, unit(poses_g.take(left)['reference'])):
-            break
-        fit, kept = estimate(fit.model, poses_g.take(left)), left
-    return fit, kept
+        covariance=covariance_with(fit, unlike), rejected=rejected, reason=reason,
+        noted=tuple(noted))
 
 
 def _unless_placed_well(poses: Poses, units: Units) -> Calibration | None:
@@ -416,15 +392,21 @@ def _unless_placed_well(poses: Poses, units: Units) -> Calibration | None:
     except RefusedFitError:  # without the outliers the poses do not determine the model
         return None
     seen = in_g(poses.take(np.isin(poses.row, fit.poses_g.row)), units)
-    u, known = sensor_force(fit.model, seen.reading, {}), unit(seen['reference'])
-    rotation = _rotation_onto(unit(u), known)
+    u = sensor_force(fit.model, seen.reading, {})
+    up, known = unit(u), unit(seen['reference'])
+    away = np.ones_like(up)
+    for _ in range(20):  # the first time with equal weights
+        size = np.linalg.norm(away, axis=1, keepdims=True)
+        weight = 1.0 / np.maximum(size, max(float(np.median(size)), 1e-6))
+        left, _, right = np.linalg.svd((up * weight).T @ known)
+        rotation = left @ right
+        away = up - known @ rotation.T
     if np.linalg.det(rotation) < 0.0:  # mirrored axes: only W can show them
         return None
-    away = unit(u) - known @ rotation.T
     # The variance across the force, from the noise and from the uncertainty of the fit [g²].
     moved = np.linalg.solve(fit.model.at({}).slope(u), fit.model.basis(u, {}).full)
     spread = moved @ by_norm.covariance @ np.swapaxes(moved, 1, 2)
-    along = np.einsum('ni,nij,nj->n', unit(u), spread, unit(u))
+    along = np.einsum('ni,nij,nj->n', up, spread, up)
     own = 2.0 * fit.equations.scale ** 2 * fit.variance
     variance = own + np.trace(spread, axis1=1, axis2=2) - along
     dof = 2.0 * len(away) - 3.0
@@ -439,27 +421,3 @@ def _unless_placed_well(poses: Poses, units: Units) -> Calibration | None:
              'determine only the rotation of the axes')
     return replace(by_norm, model=replace(by_norm.model, rotation=rotation), reason=words,
                    noted=(Finding('placement', words), *by_norm.noted))
-
-
-def _placement(fit: Fit) -> Iterator[Finding]:
-    """Yield a finding about placement errors that |force| = 1 g cannot detect in these poses."""
-    if fit.dof == 0:
-        return
-    off = fit.equations.of_poses(fit.residual)
-    angle = np.degrees(np.sqrt(3.0 * np.sum(off ** 2) / fit.dof))
-    if angle >= _WARN_DEGREES and fit.chi2 >= _WARN_CHI2 * fit.dof:
-        yield Finding('placement', f'the readings differ by {angle:.2g}° from the known '
-                      'orientations: if the placement of the sensor is not more accurate, the '
-                      'result has this error', 'take 12 or more poses in other orientations, too, '
-                      'and fit model 10')
-
-
-def _rotation_onto(directions: Floats, known: Floats) -> Floats:
-    """Return the orthogonal (3, 3) matrix R with directions = R known; robust to outliers."""
-    weight = np.ones(len(directions))
-    for _ in range(20):
-        left, _, right = np.linalg.svd((directions * weight[:, np.newaxis]).T @ known)
-        rotation: Floats = left @ right
-        away = np.linalg.norm(directions - known @ rotation.T, axis=1)
-        weight = 1.0 / np.maximum(away, max(float(np.median(away)), 1e-6))
-    return rotation

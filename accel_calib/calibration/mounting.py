@@ -184,20 +184,17 @@ def level_by_rows(calibration: Calibration, poses: Poses, frame: FrameName, flat
             raise InputError('there is a row with the nose down but no flat row, expected both',
                              'set both rows, or only the flat row')
         return replace(calibration, frame=frame)
-    reading, context = _pose_in(poses, flat, calibration)
-    levelled = level(calibration, reading, frame, context)
+    for row in (flat, nose_down):
+        if row is not None and not 1 <= row <= len(poses):
+            raise InputError(f'row {row} is not in the table, expected 1 to {len(poses)}',
+                             'correct the row number')
+    known = add_history(in_g(poses, calibration.units), calibration.model)
+    levelled = level(calibration, poses.reading[flat - 1], frame,
+                     known.take(slice(flat - 1, flat)).columns)
     if nose_down is None:
         return levelled
-    return set_heading(levelled, *_pose_in(poses, nose_down, calibration))
-
-
-def _pose_in(poses: Poses, row: int, calibration: Calibration) -> tuple[Floats, Context]:
-    """Return the reading of a row, and its context in g."""
-    if not 1 <= row <= len(poses):
-        raise InputError(f'row {row} is not in the table, expected 1 to {len(poses)}',
-                         'correct the row number')
-    known = add_history(in_g(poses, calibration.units), calibration.model)
-    return poses.reading[row - 1], known.take(slice(row - 1, row)).columns
+    return set_heading(levelled, poses.reading[nose_down - 1],
+                       known.take(slice(nose_down - 1, nose_down)).columns)
 
 
 def level(calibration: Calibration, reading: Floats, frame: FrameName,
@@ -305,15 +302,12 @@ def wiring(calibration: Calibration) -> Iterator[Finding]:
     if mat_q is None or (found := fault_of(mat_q)) is None:
         return
     level: Level = 'USABLE'
-    mirrored = np.linalg.det(mat_q) < 0.0
+    effect, mirrored = f'model {name} does not correct it', np.linalg.det(mat_q) < 0.0
     if calibration.form.known_orientation:
         level, effect = 'USABLE' if mirrored else 'GOOD', f'model {name} corrects it'
     elif mirrored:
-        level = 'BAD'
-        effect = f'model {name} does not correct it, because |force| = 1 g does not reveal it'
-    elif not calibration.is_levelled:
-        effect = f'model {name} does not correct it'
-    else:
+        level, effect = 'BAD', f'{effect}, because |force| = 1 g does not reveal it'
+    elif calibration.is_levelled:
         level, effect = 'GOOD', 'the mounting corrects it'
     advice = _ADVICE if mirrored else f'if it is not mounted this way, {_ADVICE}'
     yield Finding('wiring', f'according to the known orientations, {found}; {effect}', advice,

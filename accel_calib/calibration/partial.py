@@ -342,26 +342,28 @@ def _words_of_part(calibration: Calibration) -> tuple[str, Finding]:
     place = dict(zip(model.effects, model.terms.parts, strict=True))
     offset = covariance[place['offset'], place['offset']]
     at_each = _mg(float(np.max(deviations_g(calibration, up))))
-    if lies_in_plane(up):
-        axis, shown = np.linalg.svd(up - up.mean(axis=0))[2][2], up
+    in_plane = lies_in_plane(up)
+    axis = np.linalg.svd(up - up.mean(axis=0))[2][2] if in_plane else cone.axis
+    flat = np.eye(3) - np.outer(axis, axis)  # projects to right angles to the axis
+    beside = float(np.sqrt(np.linalg.eigvalsh(flat @ offset @ flat)[-1]))
+    if in_plane:
+        shown, along, across, tilt = up, 'across the plane', 'in it', ''
         reason = f'the {count} poses lie in a plane: at each pose |a| is known to {at_each}'
-        along, across, tilt = 'across the plane', 'in it', ''
     else:
-        axis, shown = cone.axis, cone.axis[np.newaxis]
+        shown, along, across = axis[np.newaxis], 'along gravity', 'across it'
         reason = ('along gravity the sum of offset and gain, and so |a|, is known to '
                   f'{_mg(float(deviations_g(calibration, shown)[0]))}')
         reason = f'1 pose: {reason}' if count == 1 else (
             f'the {count} poses lie within {cone.degrees:.0f}° of one direction: {reason}, and at '
             f'each pose |a| to {at_each}')
-        moved = np.linalg.solve(model.linear_part[0], model.basis(shown, {}).full[0])
-        degrees = np.degrees(_largest_across(moved @ covariance @ moved.T, axis))
-        along, across = 'along gravity', 'across it'
+        moved = flat @ np.linalg.solve(model.linear_part[0], model.basis(shown, {}).full[0])
+        degrees = np.degrees(np.sqrt(np.linalg.eigvalsh(moved @ covariance @ moved.T)[-1]))
         tilt = f' ({degrees:.1f}° of tilt until it is levelled)'
     gains = enumerated([f'±{100.0 * gain:.2g} % on {axis_name}' for axis_name, gain in zip(
         AXES, deviation[place['axis_gain']], strict=True)])
     return reason, Finding(
         'open', f'open: offset {along} ±{_mg(float(np.sqrt(axis @ offset @ axis)))}, {across} '
-        f'±{_mg(_largest_across(offset, axis))}{tilt}, gain {gains}, cross-axis '
+        f'±{_mg(beside)}{tilt}, gain {gains}, cross-axis '
         f'±{100.0 * np.max(deviation[place["cross_axis"]]):.2g} %; elsewhere on the sphere |a| is '
         f'known to {_mg(uncertainty_g(calibration))}',
         f'to determine them, {turn_words(missing_poses(NAME, shown))}')
@@ -427,12 +429,6 @@ def usable(poses: Poses, units: Units, what: str) -> tuple[Poses, tuple[Rejected
         raise RefusedFitError(f'found 0 sound poses of {counted(len(poses), "row")}, expected at '
                               'least 1', 'hold the sensor still and capture a pose')
     return sound, rejected
-
-
-def _largest_across(covariance: Floats, axis: Floats) -> float:
-    """Return the largest standard deviation at right angles to an axis."""
-    across = np.eye(3) - np.outer(axis, axis)
-    return float(np.sqrt(np.max(np.linalg.eigvalsh(across @ covariance @ across))))
 
 
 def _mg(value_g: float) -> str:

@@ -41,7 +41,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache
 from itertools import product
 import math
 from typing import Any
@@ -51,8 +51,8 @@ from numpy.typing import NDArray
 
 from .calibration import ORIENTED
 from .directions import (
-    determines, dilution, dilution_of, directions_of, error_left_in, identifiability,
-    information_of, left_out, NORM_MODELS, poses_needed, rows_of, shape_words, WEAK_DILUTION)
+    determines, dilution, dilution_of, directions_of, error_left_in, ideal_of, identifiability,
+    information_of, NORM_MODELS, poses_needed, rows_of, shape_words, WEAK_DILUTION)
 from ..effects import EffectKey, entry_of, Model
 from ..errors import RefusedFitError
 from ..estimate import Fit, fit_sphere, judge, kinds, pose_noise
@@ -160,17 +160,17 @@ class NextPose:
     planned: PlannedPose | None = None
 
 
-@lru_cache(maxsize=8)
-def _mean_information(name: str) -> Floats:
-    """Return the (p, p) information of one pose spread over the sphere."""
-    return information_of(name, OVER_THE_SPHERE) / len(OVER_THE_SPHERE)
+@cache
+def _attitudes(name: str) -> tuple[Floats, Floats, Floats]:
+    """
+    Return what a person can set by eye for a model, and what a pose determines on average.
 
+    The former are (n, 3) directions of up and their rows, and the latter is the (p, p) information
+    of one pose spread over the sphere.
 
-@lru_cache(maxsize=8)
-def _attitudes(name: str) -> tuple[Floats, Floats]:
-    """Return the (n, 3) attitudes that a person can set by eye for a model, and their rows."""
+    """
     up = ATTITUDES[:6] if name == ORIENTED else ATTITUDES
-    return up, rows_of(name, up)
+    return up, rows_of(name, up), information_of(name, OVER_THE_SPHERE) / len(OVER_THE_SPHERE)
 
 
 def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None, *,
@@ -209,7 +209,7 @@ def _error(name: str, information: Floats, count: int) -> float:
     if count < poses_needed(name) or (
             np.linalg.matrix_rank(information, hermitian=True) < len(information)):
         return np.inf
-    return float(np.sqrt(np.trace(np.linalg.solve(information, _mean_information(name)))))
+    return float(np.sqrt(np.trace(np.linalg.solve(information, _attitudes(name)[2]))))
 
 
 def _add_attitudes(name: str, directions: Floats, information: Floats, spare: int
@@ -227,11 +227,11 @@ def _add_attitudes(name: str, directions: Floats, information: Floats, spare: in
 
 def _choose_attitude(name: str, directions: Floats, information: Floats) -> Floats | None:
     """Return the untaken attitude that increases det M most, or None if all are taken."""
-    up, rows = _attitudes(name)
+    up, rows, mean_information = _attitudes(name)
     free = np.max(up @ directions.T, axis=1, initial=-1.0) < TAKEN
     if not np.any(free):
         return None
-    to_come = np.linalg.inv(information + _mean_information(name))
+    to_come = np.linalg.inv(information + mean_information)
     gains = np.linalg.slogdet(np.eye(rows.shape[1]) + rows @ to_come @ np.swapaxes(rows, 1, 2))[1]
     return up[np.argmax(np.where(free, np.round(gains, 6), -1.0))]  # the first of equals
 
@@ -324,7 +324,9 @@ def find_undetermined(chosen: str, directions: Floats, noise: Floats | None = No
 
 def _omitted_words(smaller: str, larger: str, directions: Floats, noise: Floats | None) -> str:
     """Return a text about the effects that a smaller model omits, and the typical error."""
-    words = f'it omits {enumerated(left_out(smaller, larger))}'
+    kept = ideal_of(smaller).effects
+    omitted = [str(each) for each in ideal_of(larger).effects if each not in kept]
+    words = f'it omits {enumerated(omitted)}'
     if larger == ORIENTED:
         return words
     error = error_left_in(smaller, larger, directions, noise) * MG
@@ -403,7 +405,15 @@ def plan_refinement(rivals: Sequence[Mapping[EffectKey, tuple[float, Fit]]], mod
     columns = _columns(poses_g, up, shown)
     columns['reading'] = model.at(columns).reading(up)
     candidates = Poses(columns, np.arange(1, len(up) + 1))
-    contests = [_Contest.of(each, variance, candidates) for each in rivals]
+    contests = []
+    for each in rivals:
+        judged = [judge(fit.model, candidates) for _, fit in each.values()]
+        contests.append(_Contest(
+            names=tuple(each), weights=np.array([weight for weight, _ in each.values()]),
+            means=np.array([-fit.residual.reshape(len(up), -1) for fit in judged])
+            / math.sqrt(max(variance, 1e-12)),
+            rows=[fit.columns.reshape(len(up), -1, fit.columns.shape[1]) for fit in judged],
+            spreads=[fit.by_pose.spread for _, fit in each.values()]))
     chosen: list[tuple[int, _Contest]] = []  # candidates, each with the contest that it is for
     left = list(contests)
     while len(chosen) < MOST_POSES:
@@ -443,20 +453,8 @@ class _Contest:
     names: tuple[EffectKey, ...]
     weights: Floats
     means: Floats
-    rows: tuple[Floats, ...]
-    spreads: tuple[Floats, ...]
-
-    @classmethod
-    def of(cls, fits: Mapping[EffectKey, tuple[float, Fit]], variance: float, candidates: Poses
-           ) -> _Contest:
-        """Return a contest from the probability of each model, and its fit to the poses so far."""
-        weights = np.array([weight for weight, _ in fits.values()])
-        each = [judge(fit.model, candidates) for _, fit in fits.values()]
-        count, scale = len(candidates), math.sqrt(max(variance, 1e-12))
-        means = np.array([-fit.residual.reshape(count, -1) for fit in each]) / scale
-        rows = tuple(fit.columns.reshape(count, -1, fit.columns.shape[1]) for fit in each)
-        return cls(tuple(fits), weights, means, rows,
-                   tuple(fit.by_pose.spread for _, fit in fits.values()))
+    rows: Sequence[Floats]
+    spreads: Sequence[Floats]
 
     def gains(self, taken: list[int]) -> Floats:
         """Return the (c,) expected change of the log odds by each candidate, after others."""
@@ -522,10 +520,9 @@ def _columns(poses_g: Poses, force: Floats, shown: Sequence[Mapping[str, float]]
                 *poses_g.quantities):
         if key in poses_g:
             usual = np.nanmedian(poses_g[key], axis=0)
-            found[key] = np.tile(usual, (count, 1)) if usual.ndim else np.full(count, usual)
+            found[key] = np.full((count, *usual.shape), usual)
             if key in shown[0]:
-                level = np.array([each[key] for each in shown])
-                found[key] = np.repeat(level[:, np.newaxis], 3, axis=1) if usual.ndim else level
+                found[key].T[:] = [each[key] for each in shown]
     if 'time' in poses_g:
         time = np.sort(poses_g['time'][np.isfinite(poses_g['time'])])
         step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0

@@ -126,10 +126,20 @@ def _residuals(model: Model, poses_g: Poses, units: Units, vectors: bool
 
 def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
     """Return figures of a fit; `directions` are up in each of its poses, (n, 3) unit vectors."""
-    vectors = 'reference' in fit.poses_g
-    held_out = _held_out(fit)
+    vectors, data = 'reference' in fit.poses_g, fit.by_pose
+    count, rows = data.residual.shape
+    # The errors of poses under a fit of other orientations, unless the fit needs one of them.
+    errors, checked = left_out(data.residual.ravel(), data.basis.reshape(count * rows, -1),
+                               np.repeat(np.arange(count), rows), fit.equations.force, _LEAST_OWN)
+    errors = errors.reshape(count, rows)
+    if vectors:  # differences of readings; W⁻¹ converts them to forces
+        noise = believable(fit.poses_g.noise)
+        errors = errors * (fit.equations.scale[:, np.newaxis] if noise is None else noise)
+        errors = errors @ np.linalg.inv(fit.model.linear_part[0]).T
+    else:
+        errors = errors * fit.equations.scale[:, np.newaxis]
     return Quality(*_residuals(fit.model, fit.poses_g, units, vectors),
-                   None if held_out is None else rms(held_out) * MG,
+                   None if checked < _LEAST_OWN else rms(np.linalg.norm(errors, axis=1)) * MG,
                    rms(fit.noise_g) * MG if fit.noise_known else None,
                    fit.chi2 / fit.dof if fit.noise_known and fit.dof > 0 else None,
                    coverage(directions))
@@ -161,8 +171,7 @@ def with_rest_noise(calibration: Calibration, poses: Poses) -> Calibration:
     Figures that the rests do not determine are kept.
 
     """
-    rejected = [pose.row for pose in calibration.rejected]
-    used = poses.take(~np.isin(poses.row, rejected))
+    used = poses.take(~np.isin(poses.row, [pose.row for pose in calibration.rejected]))
     return replace(calibration, gyro=gyro_bias_of(used) or calibration.gyro,
                    noise=sample_noise_of(used) or calibration.noise)
 
@@ -183,27 +192,6 @@ def errors_after(model: Model, poses_g: Poses, *, vectors: bool) -> Floats:
         force = correct(model, poses_g.reading, poses_g.columns)
         return np.linalg.norm(force - poses_g['reference'], axis=1)
     return np.linalg.norm(sensor_force(model, poses_g.reading, poses_g.columns), axis=1) - 1.0
-
-
-def _held_out(fit: Fit) -> Floats | None:
-    """
-    Return the (n,) errors of poses under a fit of other orientations [g].
-
-    None if the fit needs an orientation.
-
-    """
-    data = fit.by_pose
-    count, rows = data.residual.shape
-    found, checked = left_out(data.residual.ravel(), data.basis.reshape(count * rows, -1),
-                              np.repeat(np.arange(count), rows), fit.equations.force, _LEAST_OWN)
-    if checked < _LEAST_OWN:
-        return None
-    found = found.reshape(count, rows)
-    if 'reference' in fit.poses_g:  # differences of readings; W⁻¹ converts them to forces
-        noise = believable(fit.poses_g.noise)
-        scaled = found * (fit.equations.scale[:, np.newaxis] if noise is None else noise)
-        return np.linalg.norm(scaled @ np.linalg.inv(fit.model.linear_part[0]).T, axis=1)
-    return np.linalg.norm(found, axis=1) * fit.equations.scale
 
 
 _UNSEEN_G = 0.01
@@ -285,24 +273,8 @@ def gated(calibration: Calibration) -> Calibration:
     Raise RefusedFitError if it is not plausible.
 
     """
-    model, rotation = calibration.model, calibration.model.rotation
-    for what, values in (('value', model.vector), ('gain', model.linear_part[0]),
-                         ('rotation', rotation), ('covariance', calibration.covariance)):
-        if not np.all(np.isfinite(values)):
-            raise RefusedFitError(f'the calibration has a {what} that is not finite, expected '
-                                  'finite numbers', _CHECK_POSES)
-    if not (rotation.shape == (3, 3) and np.linalg.det(rotation) > 0.0
-            and np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROTATION_TOLERANCE)):
-        raise RefusedFitError('the mounting ΔR is not orthonormal, or it is a mirror image; '
-                              'expected a rotation', 'level the mounting again')
-    _check_covariance(calibration.covariance)
-    _check_gain(calibration)
-    _check_effects(calibration)
-    residual = calibration.quality.rms_after_mg / MG
-    if model.effects and not residual <= LARGEST_RESIDUAL_G:
-        raise RefusedFitError(
-            f'the residual is {residual * MG:.3g} mg (RMS) after the fit, expected less than '
-            f'{LARGEST_RESIDUAL_G * MG:.0f} mg: the poses are not on an ellipsoid', _CHECK_POSES)
+    _check_numbers(calibration)
+    _check_plausible(calibration)
     if calibration.method == PRIOR:
         return calibration
     uncertain = uncertainty_g(calibration)
@@ -317,39 +289,39 @@ def gated(calibration: Calibration) -> Calibration:
         noted = (*noted, Finding(
             'uncertainty', f'the uncertainty of |a| is up to {uncertain * MG:.2g} mg',
             'take more poses, spread over the sphere'))
-    return replace(calibration, noted=noted)
+    return calibration if noted == calibration.noted else replace(calibration, noted=noted)
 
 
-def _check_covariance(covariance: Floats) -> None:
-    """Refuse a covariance that is not symmetric and positive semidefinite."""
+def _check_numbers(calibration: Calibration) -> None:
+    """Refuse numbers that no calibration has, a ΔR that is no rotation, and a bad covariance."""
+    model, covariance = calibration.model, calibration.covariance
+    for what, values in (('value', model.vector), ('gain', model.linear_part[0]),
+                         ('rotation', model.rotation), ('covariance', covariance)):
+        if not np.all(np.isfinite(values)):
+            raise RefusedFitError(f'the calibration has a {what} that is not finite, expected '
+                                  'finite numbers', _CHECK_POSES)
+    if not (model.rotation.shape == (3, 3) and np.linalg.det(model.rotation) > 0.0
+            and np.allclose(model.rotation @ model.rotation.T, np.eye(3),
+                            atol=_ROTATION_TOLERANCE)):
+        raise RefusedFitError('the mounting ΔR is not orthonormal, or it is a mirror image; '
+                              'expected a rotation', 'level the mounting again')
     root = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     scaled = covariance / root / root[:, np.newaxis]
-    sound = (np.all(np.diag(covariance) >= 0.0) and np.all(np.isfinite(scaled))
-             and np.allclose(scaled, scaled.T, atol=_COVARIANCE_TOLERANCE)
-             and (not len(root)
-                  or np.min(np.linalg.eigvalsh(scaled)) >= -_COVARIANCE_TOLERANCE * len(root)))
-    if not sound:
+    if not (np.all(np.diag(covariance) >= 0.0) and np.all(np.isfinite(scaled))
+            and np.allclose(scaled, scaled.T, atol=_COVARIANCE_TOLERANCE)
+            and (not len(root) or np.min(np.linalg.eigvalsh(scaled))
+                 >= -_COVARIANCE_TOLERANCE * len(root))):
         raise RefusedFitError('the covariance is not valid, expected a symmetric and positive '
                               'semidefinite matrix', 'fit again')
 
 
-def has_usual_gains(model: Model) -> bool:
-    """Return whether the gains of a model are those of an accelerometer, in any direction."""
-    least, most = _range_of_gains(model)
-    return GAINS[0] <= least <= most <= GAINS[1]
-
-
-def _range_of_gains(model: Model) -> tuple[float, float]:
-    gains = np.linalg.svd(model.linear_part[0], compute_uv=False)
-    return float(gains[-1]), float(gains[0])
-
-
-def _check_gain(calibration: Calibration) -> None:
+def _check_plausible(calibration: Calibration) -> None:
+    """Refuse gains, an offset, effects or a residual that no working sensor has."""
     mat_w, vec_v = calibration.model.linear_part
-    least, most = _range_of_gains(calibration.model)
-    if not GAINS[0] <= least <= most <= GAINS[1]:
+    if not has_usual_gains(calibration.model):
+        gains = np.linalg.svd(mat_w, compute_uv=False)
         raise RefusedFitError('the poses are not on an ellipsoid of an accelerometer: the gains '
-                              f'are {least:.3g} to {most:.3g}, expected {GAINS[0]:g} to '
+                              f'are {gains[-1]:.3g} to {gains[0]:.3g}, expected {GAINS[0]:g} to '
                               f'{GAINS[1]:g}', f'check the units, or {_CHECK_POSES}')
     if not np.linalg.det(mat_w) > 0.0 and not calibration.form.known_orientation:
         raise RefusedFitError('the gain W is a mirror image, expected det W > 0', _CHECK_POSES)
@@ -357,19 +329,14 @@ def _check_gain(calibration: Calibration) -> None:
     if not (offset <= LARGEST_OFFSET_G or calibration.units.is_native):
         raise RefusedFitError(f'the zero-g offset is {offset:.3g} g, expected less than '
                               f'{LARGEST_OFFSET_G:g} g', _CHECK_POSES)
-
-
-def _check_effects(calibration: Calibration) -> None:
-    """Refuse effects whose contribution to a pose of the calibration is not plausible."""
     used_g = in_g(calibration.used_poses, calibration.units)
+    up = unit(used_g.reading)
     for name, values in calibration.model.values.items():
         model = Model({name: values})
         effect = model.terms.effects[0]
-        if name in LADDER or effect.output is not None or not len(used_g):
+        if name in LADDER or effect.output is not None or not len(used_g) or any(
+                key not in used_g for key in model.needs if key != 'previous'):
             continue
-        if any(key not in used_g for key in model.needs if key != 'previous'):
-            continue
-        up = unit(used_g.reading)
         along = model.at({'previous': up, **used_g.columns}).reading(up)
         added = float(np.max(np.linalg.norm(along - up, axis=1)))
         size = float(np.max(np.abs(effect.split(values)[0]))) / effect.typical
@@ -379,6 +346,17 @@ def _check_effects(calibration: Calibration) -> None:
         if not added <= effect.plausible_g:
             raise RefusedFitError(f'{name} adds up to {added:.3g} g to a reading, expected less '
                                   f'than {effect.plausible_g:g} g', _CHECK_POSES)
+    residual = calibration.quality.rms_after_mg / MG
+    if calibration.model.effects and not residual <= LARGEST_RESIDUAL_G:
+        raise RefusedFitError(
+            f'the residual is {residual * MG:.3g} mg (RMS) after the fit, expected less than '
+            f'{LARGEST_RESIDUAL_G * MG:.0f} mg: the poses are not on an ellipsoid', _CHECK_POSES)
+
+
+def has_usual_gains(model: Model) -> bool:
+    """Return whether the gains of a model are those of an accelerometer, in any direction."""
+    gains = np.linalg.svd(model.linear_part[0], compute_uv=False)
+    return bool(GAINS[0] <= gains[-1] <= gains[0] <= GAINS[1])
 
 
 def uncertainty_g(calibration: Calibration) -> float:

@@ -163,16 +163,12 @@ def sample_noise_of(poses: Poses) -> SampleNoise | None:
     found = [np.median(poses[key], axis=0) if key in poses and len(poses) else np.zeros(3)
              for key in ('std', 'rate_std')]
     force, rate = (np.where(each > 0.0, each, np.nan) for each in found)
-    if 'rate' in poses and len(poses) and not _in_rad_s(poses['rate']):
+    if 'rate' in poses and len(poses) and not np.all(
+            np.abs(np.median(poses['rate'], axis=0)) < LARGEST_BIAS):
         rate = np.full(3, np.nan)
     if np.isnan(force).all() and np.isnan(rate).all():
         return None
     return SampleNoise(force, rate)
-
-
-def _in_rad_s(rate: Floats) -> bool:
-    """Return whether rates at rest can be in rad/s; those of a raw gyro are counts."""
-    return bool(np.all(np.abs(np.median(rate, axis=0)) < LARGEST_BIAS))
 
 
 def gyro_bias_of(poses: Poses) -> GyroBias | None:
@@ -185,19 +181,25 @@ def gyro_bias_of(poses: Poses) -> GyroBias | None:
     """
     if 'rate' not in poses or len(poses) < LEAST_RESTS:
         return None
-    if not np.any(poses['rate']) or not _in_rad_s(poses['rate']):
+    middle = np.median(poses['rate'], axis=0)
+    if not np.any(poses['rate']) or not np.all(np.abs(middle) < LARGEST_BIAS):
         return None
     if 'time' in poses:
         poses = poses.take(np.argsort(poses['time'], kind='stable'))
-    rests = poses.take(_agreeing(poses))
+    noise = np.full(poses['rate'].shape, _TINY)  # variances of the mean rates, by the samples
+    if 'rate_std' in poses and 'count' in poses:
+        noise = poses['rate_std'] ** 2 / poses['count'][:, np.newaxis] + _TINY
+    agree = _find_agreeing(poses, noise)
+    rests, noise = poses.take(agree), noise[agree]
     level = line = np.ones((len(rests), 1))
     warm = rests.columns.get('temperature', np.zeros(len(rests)))
     if len(rests) >= _ENOUGH and np.ptp(warm) > 0.0:
         line = np.column_stack([level, warm - warm.mean()])
-    (_, slope), (_, slope_sd) = _fitted([line] * 3, rests)
+    (_, slope), (_, slope_sd) = _fit_axes([line] * 3, rests['rate'], noise)
     limit = float(scipy.special.stdtrit(len(rests) - 2, 1.0 - _TAIL))
     sloping = np.abs(slope) > limit * slope_sd
-    (bias, slope), (sd, _) = _fitted([line if each else level for each in sloping], rests)
+    (bias, slope), (sd, _) = _fit_axes([line if each else level for each in sloping],
+                                       rests['rate'], noise)
     if np.any(np.abs(bias) >= LARGEST_BIAS) or np.any(sd >= _LARGEST_SD):
         return None
     if 'temperature' not in rests:
@@ -207,20 +209,23 @@ def gyro_bias_of(poses: Poses) -> GyroBias | None:
     return GyroBias(bias, sd, len(rests), mean, slope, temperatures=limits)
 
 
-def _noise_of(rests: Poses) -> Floats:
-    """Return the (n, 3) variances of the mean rates that the noise of the samples causes."""
-    if 'rate_std' not in rests or 'count' not in rests:
-        return np.full(rests['rate'].shape, _TINY)
-    return np.asarray(rests['rate_std'] ** 2 / rests['count'][:, np.newaxis] + _TINY)
-
-
-def _agreeing(rests: Poses) -> NDArray[np.bool_]:
+def _find_agreeing(rests: Poses, noise: Floats) -> NDArray[np.bool_]:
     """Return which rests have the rate that noise and scatter explain."""
-    count, left, noise = len(rests), rests['rate'], _noise_of(rests)
+    count, left = len(rests), rests['rate']
     with_slope = 'temperature' in rests and count >= _ENOUGH
-    if with_slope:
+    if with_slope:  # that of a robust line
         temperature = rests['temperature']
-        left = left - temperature[:, np.newaxis] * _slope_of_pairs(left, temperature)
+        rows = np.unique(np.linspace(0, count - 1, min(count, _PAIRED)).astype(np.intp))
+        one, other = (rows[each] for each in np.triu_indices(len(rows), 1))
+        apart = temperature[other] - temperature[one]
+        one, other, apart = (each[apart != 0.0] for each in (one, other, apart))
+        if len(apart):
+            slopes = (left[other] - left[one]) / apart[:, np.newaxis]
+            order = np.argsort(slopes, axis=0)
+            weight = np.cumsum(np.abs(apart)[order], axis=0)
+            middle = np.argmax(weight >= 0.5 * weight[-1], axis=0)
+            slope = slopes[order[middle, np.arange(3)], np.arange(3)]
+            left = left - temperature[:, np.newaxis] * slope
     left = np.abs(left - np.median(left, axis=0))
     factor = _MAD_FEW[count] if count < len(_MAD_FEW) else count / (count - 0.8)
     spread = SIGMA_OF_MAD * factor * np.median(left, axis=0)
@@ -229,43 +234,38 @@ def _agreeing(rests: Poses) -> NDArray[np.bool_]:
     return np.asarray(np.all(left ** 2 <= limit ** 2 * (noise + scatter), axis=1))
 
 
-def _slope_of_pairs(values: Floats, temperature: Floats) -> Floats:
-    """Return the (3,) weighted medians of the slopes of all pairs; see the module."""
-    count = len(temperature)
-    rows = np.unique(np.linspace(0, count - 1, min(count, _PAIRED)).astype(np.intp))
-    one, other = (rows[each] for each in np.triu_indices(len(rows), 1))
-    apart = temperature[other] - temperature[one]
-    one, other, apart = (each[apart != 0.0] for each in (one, other, apart))
-    if not len(apart):
-        return np.zeros(3)
-    slopes = (values[other] - values[one]) / apart[:, np.newaxis]
-    order = np.argsort(slopes, axis=0)
-    weight = np.cumsum(np.abs(apart)[order], axis=0)
-    middle = np.argmax(weight >= 0.5 * weight[-1], axis=0)
-    return np.asarray(np.take_along_axis(slopes, np.take_along_axis(
-        order, middle[np.newaxis], axis=0), axis=0)[0])
-
-
-def _fitted(designs: Sequence[Floats], rests: Poses) -> tuple[Floats, Floats]:
+def _fit_axes(designs: Sequence[Floats], rates: Floats, noises: Floats) -> tuple[Floats, Floats]:
     """
-    Fit the rates of each axis with noise and scatter, by its (n, 1 or 2) design.
+    Fit the (n, 3) rates with noise (variances) and scatter, each by its (n, 1 or 2) design.
 
     Return the (2, 3) bias and slope by axis, and their standard deviations, which include the
     correlation of successive rests.
 
     """
-    values, variance, residual = [], [], []
-    for design, rate, noise in zip(designs, rests['rate'].T, _noise_of(rests).T, strict=True):
-        count, size = design.shape
+    values, variances, residual = [], [], []
+    for design, rate, noise in zip(designs, rates.T, noises.T, strict=True):
+        (count, size), scatter = design.shape, 0.0
+        # At τ², the weighted squares have their expected sum; see the module. The steps are
+        # Newton's for one over this sum, which is linear in τ² for rests of equal noise.
+        for _ in range(50):
+            variance = noise + scatter
+            inverse = np.linalg.inv(design.T / variance @ design)
+            found = inverse @ (design.T / variance @ rate)
+            left = rate - design @ found
+            squares = left ** 2 / variance
+            total = np.sum(squares)
+            step = float(total * (total / (count - size) - 1.0)
+                         / max(np.sum(squares / variance), 1e-300))
+            if step <= 1e-9 * scatter:  # rounding
+                break
+            scatter += step
         surplus = float(scipy.special.stdtrit(count - size, _CONFIDENCE)) / NORMAL_95
-        scatter = _scatter(design, rate, noise)
-        found, inverse, left = _weighted(design, rate, noise + scatter)
-        share = (noise + surplus ** 2 * scatter) / (noise + scatter) ** 2
+        share = (noise + surplus ** 2 * scatter) / variance ** 2
         covariance = inverse @ (design.T * share @ design) @ inverse
         values.append(np.pad(found, (0, 2 - size)))
-        variance.append(np.pad(np.diag(covariance), (0, 2 - size)))
-        residual.append(left / np.sqrt(noise + scatter))
-    found, spread, left = map(np.column_stack, (values, variance, residual))
+        variances.append(np.pad(np.diag(covariance), (0, 2 - size)))
+        residual.append(left / np.sqrt(variance))
+    found, spread, left = map(np.column_stack, (values, variances, residual))
     count, square = len(left), float(np.sum(left ** 2))
     if count >= _ENOUGH and square > 0.0:
         # Without the mean, independent residuals have a correlation of -1/n.
@@ -273,29 +273,3 @@ def _fitted(designs: Sequence[Floats], rests: Poses) -> tuple[Floats, Floats]:
         correlation = min(max(correlation, 0.0), _CORRELATION_MAX)
         spread = spread * ((1.0 + correlation) / (1.0 - correlation))
     return found, np.sqrt(spread)
-
-
-def _weighted(design: Floats, rate: Floats, variance: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the least squares values, their covariance, and the residuals."""
-    inverse = np.linalg.inv(design.T / variance @ design)
-    values = inverse @ (design.T / variance @ rate)
-    return values, inverse, rate - design @ values
-
-
-def _scatter(design: Floats, rate: Floats, noise: Floats) -> float:
-    """
-    Return τ², at which the weighted squares have their expected sum; see the module.
-
-    The steps are Newton's for one over this sum, which is linear in τ² for rests of equal noise.
-
-    """
-    dof, scatter = design.shape[0] - design.shape[1], 0.0
-    for _ in range(50):
-        variance = noise + scatter
-        squares = _weighted(design, rate, variance)[2] ** 2 / variance
-        total = np.sum(squares)
-        step = float(total * (total / dof - 1.0) / max(np.sum(squares / variance), 1e-300))
-        if step <= 1e-9 * scatter:  # rounding
-            break
-        scatter += step
-    return scatter

@@ -39,10 +39,8 @@ least squares with this noise, averaged over the grid.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 import scipy
 
 from .calibration import Calibration, PRIOR, Quality
@@ -165,18 +163,18 @@ class Curve:
     @property
     def change_mg(self) -> float:
         """Return the change of the reading with the temperature, RMS of the vector [mg]."""
-        return _rms_mg(self.change)
+        return rms(np.linalg.norm(self.change, axis=1)) * MG
 
     @property
     def residual_mg(self) -> float:
         """Return what the effects leave of it, RMS of the vector [mg]."""
-        return _rms_mg(self.left)
+        return rms(np.linalg.norm(self.left, axis=1)) * MG
 
     @property
     def calibrated(self) -> tuple[Model, Floats]:
         """Return the effects of a calibration, zero at the reference, and their covariance."""
-        found = self.model if self.model.effects else _UNCHANGED
-        covariance = self.covariance if self.model.effects else np.zeros((len(found.vector),) * 2)
+        found, covariance = (self.model, self.covariance) if self.model.effects else (
+            _UNCHANGED, np.zeros((len(_UNCHANGED.vector),) * 2))
         if self.reference_c == REFERENCE_TEMPERATURE:
             return found, covariance
         here = self._steady(np.array([self.reference_c]))
@@ -187,55 +185,46 @@ class Curve:
 
 @dataclass(frozen=True)
 class _Board:
-    """Stretches of all ramps, the ramp of each, and the context of each ramp."""
+    """
+    Stretches of all ramps.
+
+    The (n, r) `levels` are 1 where a stretch belongs to a ramp and 0 elsewhere, and `contexts` are
+    columns by ramp.
+
+    """
 
     stretches: Poses
-    group: NDArray[np.intp]
-
-    @cached_property
-    def parts(self) -> NDArray[np.intp]:
-        """(n,) array, the part of each, with equal shares of time and way of the temperature."""
-        warm = self.stretches['temperature']
-        way = np.abs(np.diff(warm, prepend=warm[0]))
-        share = np.cumsum(way / max(float(way.sum()), 1e-9) + 1.0 / len(warm)) / 2.0
-        return np.minimum((share * _BLOCKS).astype(np.intp), _BLOCKS - 1)
-
-    @cached_property
-    def levels(self) -> Floats:
-        """(n, r) array, which stretch belongs to which ramp."""
-        return np.eye(int(self.group.max()) + 1)[self.group]
-
-    @cached_property
-    def contexts(self) -> list[Context]:
-        """Columns by ramp."""
-        return [{key: self.stretches[key][self.group == k]
-                 for key in ('time', 'temperature', _RATE)} for k in range(self.levels.shape[1])]
+    levels: Floats
+    contexts: Sequence[Context]
 
     def columns(self, form: Form) -> Floats:
         """Return the (n, k) factors of effects."""
-        found = np.empty((len(self.group), len(form)))
-        for column, (name, shape) in zip(found.T, form.items(), strict=True):
-            column[:] = np.concatenate([factors_of(name, [shape], each)[0, 0]
-                                        for each in self.contexts])
-        return found
+        found = [np.concatenate([factors_of(name, [shape], each)[0, 0] for each in self.contexts])
+                 for name, shape in form.items()]
+        return np.reshape(found, (len(form), len(self.levels))).T
 
     def errors(self, form: Form) -> Floats:
         """
         Return the mean squared error of each part, predicted from a fit of the others [g²].
 
-        With the orthonormal columns Q of the fit of all, the errors r of a part become
-        r + Q_b (I - Q_bᵀ Q_b)⁻¹ Q_bᵀ r.
+        The parts have equal shares of time and way of the temperature. With the orthonormal
+        columns Q of the fit of all, the errors r of a part become r + Q_b (I - Q_bᵀ Q_b)⁻¹ Q_bᵀ r.
 
         """
+        warm = self.stretches['temperature']
+        way = np.abs(np.diff(warm, prepend=warm[0]))
+        share = np.cumsum(way / max(float(way.sum()), 1e-9) + 1.0 / len(warm)) / 2.0
+        parts = np.minimum((share * _BLOCKS).astype(np.intp), _BLOCKS - 1)
         basis = np.linalg.qr(np.column_stack([self.levels, self.columns(form)]))[0]
         left = self.stretches.reading - basis @ (basis.T @ self.stretches.reading)
-        rows = [self.parts == part for part in np.unique(self.parts)]
-        own = [basis[each] for each in rows]
-        rest = np.linalg.pinv(np.eye(basis.shape[1]) - np.array([each.T @ each for each in own]),
-                              hermitian=True)
-        return np.array([
-            np.mean(np.sum((left[row] + each @ (more @ (each.T @ left[row]))) ** 2, axis=1))
-            for row, each, more in zip(rows, own, rest, strict=True)])
+        found = []
+        for part in np.unique(parts):
+            own = basis[parts == part]
+            rest = np.linalg.pinv(np.eye(basis.shape[1]) - own.T @ own, hermitian=True)
+            away = left[parts == part]
+            away = away + own @ (rest @ (own.T @ away))
+            found.append(np.mean(np.sum(away ** 2, axis=1)))
+        return np.array(found)
 
     def is_better(self, one: Floats, other: Floats) -> bool:
         """Return whether the first errors of held-out parts are clearly smaller."""
@@ -260,56 +249,48 @@ class _Board:
             yield {**form, **{name: np.array(EFFECTS[name].usual)
                               for name in _POWERS[degree:more]}}
         steady = {name: shape for name, shape in form.items() if name != _RATE}
+        powers = {_LINEAR: np.array(EFFECTS[_LINEAR].usual),
+                  **{name: shape for name, shape in form.items() if name in _POWERS}}
+        bases = [np.linalg.qr(np.column_stack([self.levels, self.columns(each)]))[0]
+                 for each in ({}, powers)]
         for name in (*([] if _RATE in form or _lagged(form) else [_RATE]),
                      *([_LINEAR] if degree else [])):
             for shape in self.shapes(name):
-                if self._is_apart(self.columns({name: shape}), steady):
+                column = self.columns({name: shape})
+                moved, apart = (np.linalg.norm(column - basis @ (basis.T @ column))
+                                for basis in bases)
+                if apart > _APART * moved > 0.0:  # levels and temperature do not replace it
                     yield {**steady, name: shape}
         if _STEP not in form:
             for shape in self.shapes(_STEP):
                 yield {**form, _STEP: shape}
 
-    def _is_apart(self, column: Floats, form: Form) -> bool:
-        """Return whether the levels, the temperature and a form do not replace a column."""
-        others = {_LINEAR: np.array(EFFECTS[_LINEAR].usual),
-                  **{name: shape for name, shape in form.items() if name in _POWERS}}
-        left = [column - basis @ (basis.T @ column) for basis in (
-            np.linalg.qr(np.column_stack([self.levels, self.columns(each)]))[0]
-            for each in ({}, others))]
-        moved, apart = map(np.linalg.norm, left)
-        return bool(apart > _APART * moved > 0.0)
-
-    def fitted(self, form: Form) -> tuple[Model, Floats]:
+    def fit(self, form: Form) -> tuple[Model, Floats]:
         """Return effects fitted by least squares, and the covariance of their values."""
-        reading, count = self.stretches.reading, len(self.group)
-        solved = np.linalg.lstsq(np.column_stack([self.levels, self.columns(form)]), reading,
-                                 rcond=None)[0]
-        parts = dict(zip(form, solved[self.levels.shape[1]:], strict=True))
-        model = Model({name: np.concatenate([part, form[name]]) for name, part in parts.items()})
+        reading, count = self.stretches.reading, len(self.levels)
+        model = Model({name: np.concatenate([np.zeros(3), shape]) for name, shape in form.items()})
         levels = np.kron(np.eye(3), self.levels).reshape(3, count, -1)
-        for _ in range(10 if _lagged(form) else 1):  # a lag, from the best one of the catalogue
+        for _ in range(11 if _lagged(form) else 1):  # a lag, from the best one of the catalogue
             own = np.moveaxis(_basis(model, self.contexts)[..., model.fitted], 1, 0)
             design = np.concatenate([levels, own], axis=2).reshape(3 * count, -1)
-            onto = np.linalg.pinv(design)
+            onto = np.linalg.pinv(design)[levels.shape[2]:]
             vector = model.vector.copy()
-            vector[model.fitted] += (onto @ (reading - self.predicted(model)).T.ravel())[
-                levels.shape[2]:]
+            vector[model.fitted] += onto @ (reading - self.predicted(model)).T.ravel()
             found = dict(zip(model.effects, (vector[part] for part in model.terms.parts)))
             if model.lags:  # stay positive
                 found[_LINEAR][3] = np.clip(found[_LINEAR][3], *(
                     np.array([0.5, 2.0]) * model.values[_LINEAR][3]))
             model = Model(found)
-        onto = onto[levels.shape[2]:].reshape(-1, 3, count)
         covariance = np.zeros((len(model.vector),) * 2)
         covariance[np.ix_(model.fitted, model.fitted)] = self._covariance(
             np.column_stack([self.levels, self.columns({
                 str(name): entry_of(name).split(values)[1]
-                for name, values in model.values.items()})]), onto)
+                for name, values in model.values.items()})]), onto.reshape(-1, 3, count))
         return model, covariance
 
     def is_seen(self, form: Form, name: str) -> bool:
         """Return whether an effect of a form differs from 0; a step also shows as a jump."""
-        model, covariance = self.fitted(form)
+        model, covariance = self.fit(form)
         part, values = model.terms.parts[model.effects.index(name)], model.values[name]
         size, own = values[:3], slice(part.start, part.start + 3)
         chance = scipy.special.chdtrc(3, size @ np.linalg.solve(covariance[own, own], size))
@@ -326,7 +307,7 @@ class _Board:
     def predicted(self, model: Model) -> Floats:
         """Return the (n, 3) offset of each stretch [g]."""
         if not model.effects:
-            return np.zeros((len(self.group), 3))
+            return np.zeros((len(self.levels), 3))
         return np.concatenate([model.at(each).vec_v for each in self.contexts])
 
     def _covariance(self, design: Floats, onto: Floats) -> Floats:
@@ -369,49 +350,43 @@ def _basis(model: Model, contexts: Sequence[Context]) -> Floats:
 
 def curve_of(ramps: Sequence[Ramp]) -> Curve:
     """Return the effects of temperature from the ramps of one board, of any orientation."""
-    board = _joined(ramps)
-    form: Form = {}
-    errors = board.errors(form)
-    held_out = {'': _held_out_mg(errors)}
-    while better := [(each, own) for each in board.further(form)
-                     if board.is_better(own := board.errors(each), errors)]:
-        form, errors = min(better, key=lambda each: float(np.mean(each[1])))
-        held_out[' + '.join(form)] = _held_out_mg(errors)
-    form, errors = _without_idle(board, form, errors)
-    held_out.pop(' + '.join(form), None)
-    held_out[' + '.join(form)] = _held_out_mg(errors)  # the last one
-    model, covariance = board.fitted(form)
-    stretches = board.stretches
-    low, high = range_of(stretches, 'temperature')
-    reference = float(np.clip(REFERENCE_TEMPERATURE, low, high))
-    offset = board.predicted(model)
-    rest = np.array([np.mean((stretches.reading - offset)[board.group == k], axis=0)
-                     for k in range(len(ramps))])[board.group]
-    left = stretches.reading - offset - rest
-    curve = Curve(reference, (low, high), model, covariance, held_out,
-                  any(each.both for each in ramps), stretches, np.zeros(3), left)
-    at_25 = curve.at(np.array([REFERENCE_TEMPERATURE]))
-    return replace(curve, change=left + offset + at_25)
-
-
-def _joined(ramps: Sequence[Ramp]) -> _Board:
-    """Return the stretches of all ramps, one after the other in time."""
-    group = np.repeat(np.arange(len(ramps)), [len(each.stretches) for each in ramps])
     tables, end = [], -np.inf
-    for each in (ramp.stretches for ramp in ramps):
+    for each in (ramp.stretches for ramp in ramps):  # one after the other in time
         time = each['time']
         if time[0] <= end:  # another clock
             time = time - time[0] + end + np.ptp(time)
         tables.append(each.with_columns(time=time))
         end = float(time[-1])
+    group = np.repeat(np.arange(len(tables)), [len(each) for each in tables])
     columns = {key: np.concatenate([each[key] for each in tables]) for key in tables[0].columns}
     columns['orientation'] = -1.0 - group  # no number of a pose
     first = tables[0]
-    return _Board(Poses(columns, numbered(columns), 'g', first.sensor, first.autopilot), group)
-
-
-def _held_out_mg(errors: Floats) -> float:
-    return float(np.sqrt(np.mean(errors))) * MG
+    stretches = Poses(columns, numbered(columns), 'g', first.sensor, first.autopilot)
+    levels = np.eye(len(tables))[group]
+    board = _Board(stretches, levels, [{key: each[key] for key in ('time', 'temperature', _RATE)}
+                                       for each in tables])
+    form: Form = {}
+    errors = board.errors(form)
+    held_out = {'': errors}
+    while better := [(each, own) for each in board.further(form)
+                     if board.is_better(own := board.errors(each), errors)]:
+        form, errors = min(better, key=lambda each: float(np.mean(each[1])))
+        held_out[' + '.join(form)] = errors
+    form, errors = _without_idle(board, form, errors)
+    held_out.pop(' + '.join(form), None)
+    held_out[' + '.join(form)] = errors  # the last one
+    model, covariance = board.fit(form)
+    low, high = range_of(stretches, 'temperature')
+    offset = board.predicted(model)
+    left = stretches.reading - offset
+    left = left - levels @ (levels.T @ left / levels.sum(axis=0)[:, np.newaxis])
+    curve = Curve(
+        reference_c=float(np.clip(REFERENCE_TEMPERATURE, low, high)), range_c=(low, high),
+        model=model, covariance=covariance, both=any(each.both for each in ramps),
+        held_out_mg={name: float(np.sqrt(np.mean(each))) * MG for name, each in held_out.items()},
+        stretches=stretches, change=np.zeros(3), left=left)
+    at_25 = curve.at(np.array([REFERENCE_TEMPERATURE]))
+    return replace(curve, change=left + offset + at_25)
 
 
 def _without_idle(board: _Board, form: Form, errors: Floats) -> tuple[Form, Floats]:
@@ -485,28 +460,26 @@ def thermal_alone(curve: Curve, units: Units, *, sensor: str = '', date: str = '
 
     """
     model, covariance = curve.calibrated
-    rows = ramp_rows(curve, units)
-    noise = curve.stretches.noise
-    floor = None if noise is None else _rms_mg(noise)
+    rows, noise = ramp_rows(curve, units), curve.stretches.noise
     before, after = (np.linalg.norm(each, axis=1) for each in (curve.change, curve.left))
     quality = Quality(
-        curve.change_mg, curve.residual_mg, float(before.max()) * 100.0,
-        float(after.max()) * 100.0, [*curve.held_out_mg.values()][-1], floor, None,
-        coverage(unit(rows.reading)))
+        rms_before_mg=curve.change_mg, rms_after_mg=curve.residual_mg,
+        max_before_percent=float(before.max()) * 100.0,
+        max_after_percent=float(after.max()) * 100.0,
+        held_out_rms_mg=[*curve.held_out_mg.values()][-1], chi2_per_dof=None,
+        noise_floor_mg=None if noise is None else rms(np.linalg.norm(noise, axis=1)) * MG,
+        coverage=coverage(unit(rows.reading)))
     return finished(Calibration(
-        'ideal', PRIOR, model, units, rows.sensor, 'ros', '', covariance,
-        quality, rows, (), f'{_words(curve)} alone, relative to {curve.reference_c:.1f} °C',
-        findings_of_curve(curve)), sensor, date)
+        name='ideal', method=PRIOR, model=model, units=units, sensor=rows.sensor, frame='ros',
+        date='', covariance=covariance, quality=quality, poses=rows, rejected=(),
+        reason=f'{_words(curve)} alone, relative to {curve.reference_c:.1f} °C',
+        noted=findings_of_curve(curve)), sensor, date)
 
 
 def _words(curve: Curve) -> str:
     """Return what a calibration has of a curve."""
     others = [str(name) for name in curve.model.effects if name not in _POWERS]
     return ' and '.join([f'offset over temperature of degree {curve.degree}', *others])
-
-
-def _rms_mg(vectors: Floats) -> float:
-    return rms(np.linalg.norm(vectors, axis=1)) * MG
 
 
 def without_curve(curve: Curve, poses: Poses, units: Units) -> Poses:
@@ -523,20 +496,20 @@ def without_curve(curve: Curve, poses: Poses, units: Units) -> Poses:
         raise InputError('the poses have no temperature, expected one for each', 'record the '
                          'temperature with the poses, too, or name its column with --columns '
                          'temperature=NAME')
-    moved = poses.reading - units.from_g(_added(curve, poses))
+    moved = poses.reading - units.from_g(_predict(curve, poses)[1])
     return poses.without_columns('reference', 'orientation').with_columns(reading=moved)
 
 
-def _of_poses(curve: Curve) -> Model:
-    """Return the effects that act on poses of another log, whose time is another one: no step."""
-    return Model({name: values for name, values in curve.model.values.items() if name != _STEP})
+def _predict(curve: Curve, poses: Poses) -> tuple[Model, Floats]:
+    """
+    Return the effects that act on poses of another log, and what they add to each [g].
 
+    It is relative to 25 °C. The time of the other log is another one: there is no step.
 
-def _added(curve: Curve, poses: Poses) -> Floats:
-    """Return what the temperature adds to each pose, relative to 25 °C [g]."""
-    model = _of_poses(curve)
+    """
+    model = Model({name: values for name, values in curve.model.values.items() if name != _STEP})
     known = add_history(poses, model).columns
-    return np.zeros((len(poses), 3)) + model.at(known).vec_v
+    return model, np.zeros((len(poses), 3)) + model.at(known).vec_v
 
 
 def with_curve(fitted: Calibration, curve: Curve, poses: Poses) -> Calibration:
@@ -548,12 +521,13 @@ def with_curve(fitted: Calibration, curve: Curve, poses: Poses) -> Calibration:
     the poses.
 
     """
-    thermal = _of_poses(curve)
+    used_g = in_g(fitted.used_poses, fitted.units)
+    thermal, added = _predict(curve, used_g)
     if not thermal.effects:
         thermal = _UNCHANGED
     model, own = Model({**fitted.model.values, **thermal.values}), len(fitted.model.vector)
-    used_g = add_history(in_g(fitted.used_poses, fitted.units), model)
-    moved = only_norm(used_g.with_columns(reading=used_g.reading + _added(curve, used_g)))
+    used_g = add_history(used_g, model)
+    moved = only_norm(used_g.with_columns(reading=used_g.reading + added))
     known = {key: used_g[key] for key in ('time', 'temperature', _RATE) if key in used_g}
     judged = judge(model, moved.with_columns(**known))
     columns = judged.columns @ judged.ties.T

@@ -21,7 +21,7 @@ from all runs together,
 where the measured noise of the runs counts as b degrees of freedom (for each run as in
 `accel_calib.estimate.fit.Fit.variance`), unless the residuals contradict it. A run whose poses
 repeat significantly worse than those of the others keeps its own scale, and so does one whose
-covariance was estimated beside a scatter (`accel_calib.estimate.scatter`).
+covariance was estimated beside a scatter (`accel_calib.estimate.outliers`).
 
 A smaller model assumes that the omitted effects are exactly zero, but `auto` omits effects that
 are hidden in the noise. The uncertainty of such a run is therefore that of the largest model of
@@ -65,7 +65,7 @@ NAMES = ('offset.x', 'offset.y', 'offset.z', 'gain.x', 'gain.y', 'gain.z', 'gain
          'gain.yz')
 """V, and the diagonal and the upper triangle of S."""
 
-_ENTRIES = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])
+ENTRIES = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])
 
 
 @dataclass(frozen=True)
@@ -86,18 +86,6 @@ class RotationFree:
     axes: Floats
     reading_scale: float
     force_scale: float
-
-    @property
-    def vec_v(self) -> Floats:
-        """V, (3,) [g]."""
-        return self.values[:3]
-
-    @property
-    def mat_s(self) -> Floats:
-        """S, (3, 3)."""
-        matrix = np.zeros((3, 3))
-        matrix[_ENTRIES] = self.values[3:9]
-        return matrix + np.triu(matrix, 1).T
 
 
 def rotation_free(calibration: Calibration, context: Context, per_g: float) -> RotationFree:
@@ -132,8 +120,8 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
     size = len(model.vector)
     return RotationFree(
         (*NAMES, *(calibration.parameters[k] for k in own)),
-        np.concatenate([vec_v * reading_scale, mat_s[_ENTRIES] * gain_scale, model.vector[own]]),
-        np.concatenate([slope_v * reading_scale, slope_s[_ENTRIES] * gain_scale,
+        np.concatenate([vec_v * reading_scale, mat_s[ENTRIES] * gain_scale, model.vector[own]]),
+        np.concatenate([slope_v * reading_scale, slope_s[ENTRIES] * gain_scale,
                         np.eye(size)[own]]),
         axes=np.linalg.solve(mat_s, mat_w) @ model.rotation, reading_scale=reading_scale,
         force_scale=force_scale)
@@ -184,31 +172,26 @@ def on_one_scale(runs: Sequence[Repeatability]) -> CommonScale:
     factors, noisier, dofs = np.ones(len(runs)), [], []
     for measured in (True, False):  # without measured noise, chi² has no unit
         group = [k for k, run in enumerate(runs) if (run.belief > 0.0) is measured]
-        scale, dof, worse = _pooled([runs[k] for k in group])
-        for j, k in enumerate(group):
-            own = runs[k].chi2 / runs[k].dof if j in worse else scale
-            factors[k] = own / runs[k].stated if runs[k].stated > 0.0 and dof > 0.0 else 1.0
-        noisier += [group[j] for j in worse]
+        pool, worse = [runs[k] for k in group if runs[k].dof == 0], []
+        own = {k: runs[k].chi2 / runs[k].dof for k in group if runs[k].dof > 0}
+        for k in sorted(own, key=own.__getitem__):
+            scale, dof = _scale_of(pool)
+            chance = scipy.special.fdtrc(runs[k].dof, max(dof, 1.0), own[k] / max(scale, 1e-300))
+            if dof > 0.0 and chance < _WORSE:
+                worse.append(k)
+            else:
+                pool.append(runs[k])
+        scale, dof = _scale_of(pool)
+        for k in group:
+            if runs[k].stated > 0.0 and dof > 0.0:
+                factors[k] = (own[k] if k in worse else scale) / runs[k].stated
+        noisier += worse
         dofs += [dof] if dof > 0.0 else []
     scaled = tuple(run.covariance * factor for run, factor in zip(runs, factors, strict=True))
     return CommonScale(scaled, min(dofs, default=np.inf), tuple(sorted(noisier)))
 
 
-def _pooled(runs: Sequence[Repeatability]) -> tuple[float, float, list[int]]:
-    """Pool runs; return the scale, its degrees of freedom, and the noisier runs."""
-    pool, worse = [run for run in runs if run.dof == 0], []
-    for k in sorted((k for k, run in enumerate(runs) if run.dof > 0),
-                    key=lambda k: runs[k].chi2 / runs[k].dof):
-        scale, dof = _scale(pool)
-        ratio = runs[k].chi2 / runs[k].dof / max(scale, 1e-300)
-        if dof > 0.0 and scipy.special.fdtrc(runs[k].dof, dof, ratio) < _WORSE:
-            worse.append(k)
-        else:
-            pool = [*pool, runs[k]]
-    return (*_scale(pool), worse)
-
-
-def _scale(pool: Sequence[Repeatability]) -> tuple[float, float]:
+def _scale_of(pool: Sequence[Repeatability]) -> tuple[float, float]:
     """Return the scale of these runs and its degrees of freedom; 1 and 0 if there are none."""
     chi2, dof = sum(run.chi2 for run in pool), sum(run.dof for run in pool)
     belief = sum(run.belief for run in pool)
@@ -250,21 +233,6 @@ class Comparable:
 
 def comparable(calibrations: Sequence[Calibration]) -> tuple[Comparable, ...]:
     """Prepare two or more calibrations of one sensor for any number of comparisons among them."""
-    _refuse_if_unlike(calibrations)
-    names = {run.form.norm for run in calibrations}
-    largest = max(names.intersection(NORM_MODELS), key=NORM_MODELS.index, default=NORM_MODELS[0])
-    found = []
-    for run in calibrations:
-        sure = run
-        larger = NORM_MODELS[NORM_MODELS.index(run.name) + 1:] if run.name in NORM_MODELS else ()
-        if largest in larger and run.model.effects == run.form.effects:
-            with suppress(RefusedFitError):  # its poses do not determine the larger model
-                sure = fit_unknown(run.used_poses, run.units, largest, 'ml')[0]
-        found.append(Comparable(run, sure, repeatability_of(sure)))
-    return tuple(found)
-
-
-def _refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
     if len(calibrations) < 2:
         raise InputError(f'found {counted(len(calibrations), "calibration")}, expected at least 2',
                          'select two or more calibrations of the same sensor')
@@ -286,6 +254,17 @@ def _refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
         if not np.all(np.isfinite(run.covariance)):
             raise InputError(f'run {k} has no uncertainty, expected a finite covariance',
                              'fit it again with more poses')
+    names = {run.form.norm for run in calibrations}
+    largest = max(names.intersection(NORM_MODELS), key=NORM_MODELS.index, default=NORM_MODELS[0])
+    found = []
+    for run in calibrations:
+        sure = run
+        larger = NORM_MODELS[NORM_MODELS.index(run.name) + 1:] if run.name in NORM_MODELS else ()
+        if largest in larger and run.model.effects == run.form.effects:
+            with suppress(RefusedFitError):  # its poses do not determine the larger model
+                sure = fit_unknown(run.used_poses, run.units, largest, 'ml')[0]
+        found.append(Comparable(run, sure, repeatability_of(sure)))
+    return tuple(found)
 
 
 LEVEL = 0.03
@@ -343,7 +322,8 @@ class Runs:
         """Probability of differences at least this large, if the runs agree."""
         count = len(self.values)
         tests = 1 if count == 2 else count
-        return _either(_beyond(*self.squared, self.dof), float(np.min(self.least)) * tests)
+        return min(1.0, 2.0 * min(_beyond(*self.squared, self.dof),
+                                  float(np.min(self.least)) * tests))
 
 
 def _beyond(chi2: float, rank: int, dof: float) -> float:
@@ -354,10 +334,6 @@ def _beyond(chi2: float, rank: int, dof: float) -> float:
                  else scipy.special.fdtrc(rank, dof, chi2 / rank))
 
 
-def _either(first: float, second: float) -> float:
-    return min(1.0, 2.0 * min(first, second))
-
-
 def p_values(runs: Runs) -> Floats:
     """Return the probability of the differences between each run and the others."""
     if len(runs.values) == 2:
@@ -366,8 +342,8 @@ def p_values(runs: Runs) -> Floats:
     found = []
     for k, least in enumerate(runs.least):
         others, others_rank = runs.without(k).squared
-        added = max(chi2 - others, 0.0)
-        found.append(_either(_beyond(added, rank - others_rank, runs.dof), float(least)))
+        chance = _beyond(max(chi2 - others, 0.0), rank - others_rank, runs.dof)
+        found.append(min(1.0, 2.0 * min(chance, float(least))))
     return np.array(found)
 
 

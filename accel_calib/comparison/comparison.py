@@ -11,15 +11,15 @@ contain its effect.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from itertools import combinations, pairwise
 
 import numpy as np
 
 from .agreement import (
-    Comparable, comparable, LEVEL, on_one_scale, outlier, p_values, rotation_free, RotationFree,
-    Runs, SAME_G)
+    Comparable, comparable, ENTRIES, LEVEL, on_one_scale, outlier, p_values, rotation_free,
+    RotationFree, Runs, SAME_G)
 from ..calibration import Calibration
 from ..effects import Context, length_rows, sensor_force
 from ..errors import InputError
@@ -53,7 +53,14 @@ def _notes_of(given: Sequence[Comparable], names: tuple[str, ...], deviation: Fl
             yield (f'run {k} (model {run.calibration.name}) omits parameters of model '
                    f'{run.sure.name}: they are taken as zero, with the uncertainty that its poses '
                    'allow')
-    yield from _left_out(names, deviation)
+    omitted: dict[tuple[int, ...], list[str]] = {}
+    for name, column in zip(names, deviation.T, strict=True):
+        without = tuple((np.flatnonzero(column == 0.0) + 1).tolist())
+        if 0 < len(without) < len(column):
+            omitted.setdefault(without, []).append(name)
+    for runs, found in omitted.items():
+        yield (f'the model of {listed("run", runs)} omits {", ".join(found)} and so assumes zero; '
+               'for an equal comparison, fit all runs with one model')
     known = [float(np.median(run.poses['temperature'])) for run in calibrations
              if 'temperature' in run.poses]
     corrected = all('temperature' in run.model.needs for run in calibrations)
@@ -63,18 +70,6 @@ def _notes_of(given: Sequence[Comparable], names: tuple[str, ...], deviation: Fl
     for k in noisier:
         yield (f'the poses of run {k + 1} repeat significantly worse than those of the others: '
                'the run has less weight')
-
-
-def _left_out(names: tuple[str, ...], deviation: Floats) -> Iterator[str]:
-    """Yield notes about parameters that only some of the models have."""
-    notes: dict[tuple[int, ...], list[str]] = {}
-    for name, column in zip(names, deviation.T, strict=True):
-        without = tuple((np.flatnonzero(column == 0.0) + 1).tolist())
-        if 0 < len(without) < len(column):
-            notes.setdefault(without, []).append(name)
-    for runs, found in notes.items():
-        yield (f'the model of {listed("run", runs)} omits {", ".join(found)} and so assumes zero; '
-               'for an equal comparison, fit all runs with one model')
 
 
 @dataclass(frozen=True)
@@ -174,32 +169,6 @@ class Comparison:
             f'{self.tilt_deg:.3g}°; the test does not use them')
 
 
-@dataclass(frozen=True)
-class _Prepared:
-    """A run with its context and rotation-free parameters."""
-
-    given: Comparable
-    context: Context
-    free: RotationFree
-    slope: Floats
-    covariance: Floats
-
-    def length(self, reading: Floats) -> tuple[Floats, Floats]:
-        """Return the corrected |a| of (n, 3) readings and its variance, in the common unit."""
-        here = {key: np.repeat(column, len(reading), 0) for key, column in self.context.items()}
-        u = sensor_force(self.given.calibration.model, reading / self.free.reading_scale, here)
-        model = self.given.sure.model
-        rows = model.basis(u, here).along(length_rows(model, u, here))
-        variance = np.maximum(np.einsum('np,pq,nq->n', rows, self.covariance, rows), 0.0)
-        scale = self.free.force_scale
-        return np.linalg.norm(u, axis=1) * scale, variance * scale ** 2
-
-    def spread(self, names: tuple[str, ...], covariance: Floats) -> Floats:
-        """Return the (t, t) covariance of the common parameters."""
-        slope = _into(names, self.free, self.slope)
-        return np.asarray(slope @ covariance @ slope.T)
-
-
 def compare(calibrations: Sequence[Calibration]) -> Comparison:
     """
     Test whether two or more calibrations of one sensor agree within their uncertainties.
@@ -217,20 +186,25 @@ def compare(calibrations: Sequence[Calibration]) -> Comparison:
 def compare_runs(given: Sequence[Comparable]) -> Comparison:
     """Test whether calibrations that were prepared together agree, two or more of them."""
     scaled = on_one_scale([run.repeatability for run in given])
-    prepared = _prepared(given, scaled.covariances)
-    names = tuple(dict.fromkeys(name for run in prepared for name in run.free.names))
-    values = np.array([_into(names, run.free, run.free.values) for run in prepared])
-    runs = Runs(values, np.array([run.spread(names, run.covariance) for run in prepared]),
-                scaled.dof)
-    stated = np.sqrt(np.maximum([np.diag(run.spread(names, run.given.sure.covariance))
-                                 for run in prepared], 0.0))
+    prepared = _prepare(given)
+    names = tuple(dict.fromkeys(name for _, free in prepared for name in free.names))
+    values = np.zeros((len(given), len(names)))  # of missing parameters, too
+    spreads = np.zeros((2, len(given), len(names), len(names)))  # on one scale, and as stated
+    for k, (run, (_, free)) in enumerate(zip(given, prepared, strict=True)):
+        place = [names.index(name) for name in free.names]
+        values[k, place] = free.values
+        for which, covariance in enumerate((scaled.covariances[k], run.sure.covariance)):
+            spreads[which, k][np.ix_(place, place)] = free.slope @ covariance @ free.slope.T
+    runs = Runs(values, spreads[0], scaled.dof)
+    stated = np.sqrt(np.maximum(np.diagonal(spreads[1], axis1=1, axis2=2), 0.0))
     (chi2, rank), p_value = runs.squared, runs.p_value
     parameters = []
     for name, column, sds in zip(names, values.T, stated.T, strict=True):
-        spread, typical = float(np.std(column, ddof=1)), rms(sds)
-        parameters.append(Parameter(name, column, sds, spread,
-                                    spread / typical if typical > 0.0 else None))
-    up = np.array([run.free.axes[:, 2] for run in prepared if run.given.calibration.is_levelled])
+        size, typical = float(np.std(column, ddof=1)), rms(sds)
+        parameters.append(Parameter(name, column, sds, size,
+                                    size / typical if typical > 0.0 else None))
+    up = np.array([free.axes[:, 2] for run, (_, free) in zip(given, prepared, strict=True)
+                   if run.calibration.is_levelled])
     tilt_deg = None
     if len(up) > 1:
         apart = np.max(np.linalg.norm(up[:, np.newaxis] - up, axis=2))
@@ -238,15 +212,17 @@ def compare_runs(given: Sequence[Comparable]) -> Comparison:
     return Comparison(
         agree=p_value >= LEVEL, p_value=p_value, chi2=chi2, dof=rank,
         outlier=outlier(runs) if p_value < LEVEL else None,
-        runs=_each(prepared, p_values(runs)), parameters=tuple(parameters), tilt_deg=tilt_deg,
+        runs=_compare_each(given, prepared, scaled.covariances, p_values(runs)),
+        parameters=tuple(parameters), tilt_deg=tilt_deg,
         notes=tuple(_notes_of(given, names, stated, scaled.noisier)))
 
 
-def _prepared(given: Sequence[Comparable], covariances: Sequence[Floats]) -> list[_Prepared]:
+def _prepare(given: Sequence[Comparable]) -> Sequence[tuple[Context, RotationFree]]:
     """
-    Return each calibration with its context and parameters in the common unit.
+    Return the context of each run, and its parameters in the common unit.
 
-    The context is one row: medians over the poses, and no motion.
+    The context is one row: medians over the poses, and no motion. The slope of the parameters is
+    that of the largest model.
 
     """
     calibrations = [run.calibration for run in given]
@@ -255,7 +231,7 @@ def _prepared(given: Sequence[Comparable], covariances: Sequence[Floats]) -> lis
                                       if key in run.poses])])
               for key in _COMMON if any(key in run.poses for run in calibrations)}
     found = []
-    for run, covariance in zip(given, covariances, strict=True):
+    for run in given:
         poses, still = run.calibration.poses, np.zeros((1, 3))
         context: dict[str, Floats] = {'rate': still, 'previous': still, **common}
         if 'time' in poses:
@@ -263,25 +239,25 @@ def _prepared(given: Sequence[Comparable], covariances: Sequence[Floats]) -> lis
         if 'std' in poses:
             std = np.median(poses['std'], axis=0)
             context['std'] = run.calibration.units.to_g(std)[np.newaxis]
-        free = rotation_free(run.calibration, context, per_g)
-        slope = rotation_free(run.sure, context, per_g).slope
-        found.append(_Prepared(run, context, free, slope, covariance))
+        found.append((context, replace(rotation_free(run.calibration, context, per_g),
+                                       slope=rotation_free(run.sure, context, per_g).slope)))
     return found
 
 
-def _into(names: tuple[str, ...], run: RotationFree, rows: Floats) -> Floats:
-    """Return (t, …) rows in the order of the common names; missing rows are zero."""
-    found = np.zeros((len(names), *rows.shape[1:]))
-    found[[names.index(name) for name in run.names]] = rows
-    return found
-
-
-def _each(prepared: Sequence[_Prepared], chances: Floats) -> tuple[Run, ...]:
+def _compare_each(given: Sequence[Comparable], prepared: Sequence[tuple[Context, RotationFree]],
+                  covariances: Sequence[Floats], chances: Floats) -> tuple[Run, ...]:
     """Compare the corrected |a| of each run with that of the others, over all directions."""
-    reading = (np.mean([run.free.vec_v for run in prepared], axis=0)
-               + OVER_THE_SPHERE @ np.mean([run.free.mat_s for run in prepared], axis=0))
-    found = [run.length(reading) for run in prepared]
-    length, variance = (np.array(part) for part in zip(*found, strict=True))
+    mean, mat_s = np.mean([free.values[:9] for _, free in prepared], axis=0), np.zeros((3, 3))
+    mat_s[ENTRIES] = mat_s.T[ENTRIES] = mean[3:]
+    reading = mean[:3] + OVER_THE_SPHERE @ mat_s
+    length, variance = np.empty((2, len(prepared), len(reading)))  # in the common unit
+    for k, (run, (context, free)) in enumerate(zip(given, prepared, strict=True)):
+        here = {key: np.repeat(column, len(reading), 0) for key, column in context.items()}
+        u = sensor_force(run.calibration.model, reading / free.reading_scale, here)
+        rows = run.sure.model.basis(u, here).along(length_rows(run.sure.model, u, here))
+        spread = np.maximum(np.einsum('np,pq,nq->n', rows, covariances[k], rows), 0.0)
+        length[k] = np.linalg.norm(u, axis=1) * free.force_scale
+        variance[k] = spread * free.force_scale ** 2
     weight = 1.0 / (np.mean(variance, axis=1) + SAME_G ** 2)
     runs = []
     for k, chance in enumerate(chances):

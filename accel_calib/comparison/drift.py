@@ -90,9 +90,12 @@ def change(error: Floats, covariance: Floats, up: Floats) -> LastingChange | Non
     most = 0.5 * float(error @ np.linalg.solve(covariance, error))
     if len(error) < _FEWEST or most - len(error) * np.log1p(-_KNOCKED) < np.log(SURE):
         return None   # the ratio cannot be larger
-    found = {(kind, rests): np.logaddexp.reduce([
-        _likelihood(error, covariance + _added(_derivative(kind, rests, up), size))
-        for size in _SIZES]) for kind in KINDS for rests in range(_FEWEST, len(error) + 1)}
+    number = np.arange(len(up), 0, -1)[:, np.newaxis]  # of rests from each one to the last
+    slopes = {(kind, rests): np.where(number <= rests, slope_of(up), 0.0)
+              for kind, slope_of in KINDS.items() for rests in range(_FEWEST, len(error) + 1)}
+    found = {key: np.logaddexp.reduce([
+        _likelihood(error, covariance + _added(slope, size)) for size in _SIZES])
+        for key, slope in slopes.items()}
     same = _likelihood(error, covariance) + np.log(len(found) * len(_SIZES))
     if np.logaddexp.reduce(list(found.values())) - same < np.log(SURE):
         return None
@@ -100,7 +103,7 @@ def change(error: Floats, covariance: Floats, up: Floats) -> LastingChange | Non
     each = [np.logaddexp.reduce([found[key] for key in found if key[0] == other])
             for other in KINDS]
     # The estimate, without the rests that were most likely knocked.
-    slope, size = _derivative(kind, rests, up), max(_SIZES)
+    slope, size = slopes[kind, rests], max(_SIZES)
     knocked, likely = _knocks(error, covariance + _added(slope, size))
     spread = covariance + np.diag(_KNOCK ** 2 * knocked[np.argmax(likely)])
     weighted = slope.T @ np.linalg.inv(spread)
@@ -119,13 +122,6 @@ def is_over(known: LastingChange, error: Floats, covariance: Floats, up: Floats)
     stays = _likelihood(error - slope @ known.shift,
                         covariance + slope @ known.covariance @ slope.T)
     return bool(_likelihood(error, covariance) - stays > np.log(SURE))
-
-
-def _derivative(kind: str, rests: int, up: Floats) -> Floats:
-    """Return the (n, q) derivative of the errors by a change before the last `rests` rests."""
-    slope = KINDS[kind](up).copy()
-    slope[:len(up) - rests] = 0.0
-    return slope
 
 
 def _added(slope: Floats, size: float) -> Floats:
@@ -257,8 +253,13 @@ def rest_errors(calibration: Calibration, reading: Floats, noise: Floats, contex
 
 def compared(before: Drift, rest: RestError, least: float) -> Drift:
     """Return the state of the monitor after one more rest; `least` is the least change [g]."""
-    rests = (*before.rests, rest)
-    scatter = _scatter(before, rests[:2]) if len(rests) > MEMORY else before.scatter
+    rests, scatter = (*before.rests, rest), before.scatter
+    if len(rests) > MEMORY:  # from two rests that are older than a possible change
+        covariance = _covariance(before, rests[:2])
+        stated = np.sqrt(covariance[0, 0] + covariance[1, 1] - 2.0 * covariance[0, 1])
+        step = max(_LEARN, 2.0 / (before.count + 4.0))
+        more = abs(rests[0].error - rests[1].error) > stated / SIGMA_OF_MAD
+        scatter = max(1.0, scatter * float(np.exp(step if more else -step)))
     after = replace(before, rests=rests[-MEMORY:], count=before.count + 1, scatter=scatter)
     covariance = _covariance(after, after.rests)
     if not np.all(np.isfinite(covariance)):
@@ -284,15 +285,6 @@ def _covariance(state: Drift, rests: tuple[RestError, ...]) -> Floats:
     noise = np.array([rest.variance for rest in rests]) + state.repeats
     spread = slope @ state.calibration.covariance @ slope.T
     return np.asarray(spread + np.diag(state.scatter ** 2 * noise))
-
-
-def _scatter(state: Drift, rests: tuple[RestError, ...]) -> float:
-    """Return the updated scatter, from two rests that are older than a possible change."""
-    covariance = _covariance(state, rests)
-    stated = np.sqrt(covariance[0, 0] + covariance[1, 1] - 2.0 * covariance[0, 1])
-    step = max(_LEARN, 2.0 / (state.count + 4.0))
-    more = abs(rests[0].error - rests[1].error) > stated / SIGMA_OF_MAD
-    return max(1.0, state.scatter * float(np.exp(step if more else -step)))
 
 
 def status(state: Drift) -> str:

@@ -5,25 +5,23 @@
 The estimator: from poses and a list of effects to values. `calibrate` and `refine` use it.
 
 `equations` sets up the equations of the poses, with the weight of the measured noise. `fit`
-minimises the residuals and computes the covariance. `outliers` fits without outliers, and finds
-mistakes that the poses do not locate or show. `scatter` estimates by how much poses repeat worse
-than their samples. `closed_form` computes start values.
+minimises the residuals and computes the covariance. `outliers` fits without outliers, or beside
+the scatter by which poses repeat worse than their samples, and finds mistakes that the poses do
+not locate or show. `closed_form` computes start values.
 
 """
 
-from .closed_form import (
-    closed_form, faces, fit_12, fit_sphere, lower_triangular, sensing_axes, start_of, TIES)
+from .closed_form import closed_form, faces, fit_12, fit_sphere, sensing_axes, start_of, TIES
 from .equations import believable, Equations, kinds, originals, pose_noise, variance_factor
 from .fit import (
     by_pose, estimate, Fit, judge, left_out, NotConvergedError, Point, Prior, solve, stated)
 from .outliers import (
-    covariance_with, fit_norm, LARGEST_SHARE, outliers, outliers_among, outliers_or_scatter, Rival,
-    rivals, unseen_mistakes)
-from .scatter import beside_scatter, scatter_of, with_scatter_of
+    beside_scatter, covariance_with, fit_robust, LARGEST_SHARE, outliers, outliers_among, Rival,
+    rivals, scatter_of, unseen_mistakes, with_scatter_of)
 
 __all__ = ['LARGEST_SHARE', 'TIES', 'Equations', 'Fit', 'NotConvergedError', 'Point', 'Prior',
            'Rival', 'believable', 'beside_scatter', 'by_pose', 'closed_form', 'covariance_with',
-           'estimate', 'faces', 'fit_12', 'fit_norm', 'fit_sphere', 'judge', 'kinds', 'left_out',
-           'lower_triangular', 'originals', 'outliers', 'outliers_among', 'outliers_or_scatter',
-           'pose_noise', 'rivals', 'scatter_of', 'sensing_axes', 'solve', 'start_of', 'stated',
-           'unseen_mistakes', 'variance_factor', 'with_scatter_of']
+           'estimate', 'faces', 'fit_12', 'fit_robust', 'fit_sphere', 'judge', 'kinds', 'left_out',
+           'originals', 'outliers', 'outliers_among', 'pose_noise', 'rivals', 'scatter_of',
+           'sensing_axes', 'solve', 'start_of', 'stated', 'unseen_mistakes', 'variance_factor',
+           'with_scatter_of']

@@ -48,7 +48,6 @@ In tests the measured noise counts as a number of degrees of freedom (moderated 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -57,7 +56,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from ..effects import AtContext, Context, EachShape, EffectKey, Model, times
+from ..effects import Context, EachShape, EffectKey, Model, times
 from ..geometry import unit
 from ..statistics import NORMAL_95, over_axes, STATED_NOISE
 from ..table import Poses
@@ -142,27 +141,18 @@ def originals(poses_g: Poses) -> Indices:
     # Two readings half a cell apart are in the same cell of at least one of these grids.
     for shift in product((0.0, 0.5), repeat=3):
         rows = np.column_stack([np.floor(place + shift), *context])
-        found = np.minimum(found, _first_equal(rows))
+        # A hash is sorted faster than rows, and few rows are not the only ones with their hash.
+        bits = (rows + 0.0).view(np.uint64)  # -0.0 becomes 0.0
+        bits ^= bits >> 32  # the low bits of whole numbers are zero
+        factors = np.random.default_rng(1).integers(2 ** 63, size=rows.shape[1], dtype=np.uint64)
+        mixed = bits @ (2 * factors + 1)
+        ordered = np.sort(mixed)
+        again = np.flatnonzero(np.isin(mixed, ordered[1:][ordered[1:] == ordered[:-1]]))
+        _, first, which = np.unique(mixed[again], return_index=True, return_inverse=True)
+        first = again[first[which]]
+        equal = np.all(rows[first] == rows[again], axis=1)
+        found[again] = np.minimum(found[again], np.where(equal, first, again))
     return found[found]
-
-
-def _first_equal(rows: Floats) -> Indices:
-    """
-    Return the (n,) index of the first row equal to each.
-
-    A hash is sorted faster than rows, and few rows are not the only ones with their hash.
-
-    """
-    bits = (rows + 0.0).view(np.uint64)  # -0.0 becomes 0.0
-    bits ^= bits >> 32  # the low bits of whole numbers are zero
-    factors = np.random.default_rng(1).integers(2 ** 63, size=rows.shape[1], dtype=np.uint64)
-    mixed, found = bits @ (2 * factors + 1), np.arange(len(rows))
-    ordered = np.sort(mixed)
-    again = np.flatnonzero(np.isin(mixed, ordered[1:][ordered[1:] == ordered[:-1]]))
-    _, first, which = np.unique(mixed[again], return_index=True, return_inverse=True)
-    first = again[first[which]]
-    found[again] = np.where(np.all(rows[first] == rows[again], axis=1), first, again)
-    return found
 
 
 def kinds(poses: Poses) -> tuple[Indices, list[Indices], Indices]:
@@ -196,12 +186,17 @@ class _Kind(NamedTuple):
 
 @dataclass(frozen=True)
 class Measured:
-    """Poses in g by kind of orientation, `alone` in blocks, and their noise; see `measured`."""
+    """
+    Poses in g by kind of orientation, those of unknown orientation in blocks; see `measured`.
 
-    known: _Kind
-    shared: _Kind
-    alone: tuple[_Kind, ...]
+    `parts` are the poses of each kind, with the class of their equations. `unknown` is the number
+    of unknown angles of shared orientations.
+
+    """
+
+    parts: tuple[tuple[type[_Known | _Shared | _Alone], _Kind], ...]
     count: int
+    unknown: int
     noise_known: bool
 
 
@@ -210,20 +205,21 @@ def measured(poses_g: Poses) -> Measured:
     reading, noise = poses_g.reading, believable(poses_g.noise)
     s = np.full(reading.shape, USUAL_NOISE_G) if noise is None else noise
     known, shared, alone = kinds(poses_g)
-
-    def kind(groups: Sequence[Indices]) -> _Kind:
-        which = np.concatenate([known[:0], *groups])
-        group = np.repeat(np.arange(len(groups)), [len(each) for each in groups])
-        if np.array_equal(which, np.arange(len(s))):
-            return _Kind(which, group, poses_g.columns, reading, s)
-        context = {key: values[which] for key, values in poses_g.columns.items()}
-        return _Kind(which, group, context, reading[which], s[which])
-
     # The context of a pose can be that of the others, too: a low pass has a history.
     size = _BLOCK if {*poses_g.columns} <= {*_OF_READING} else max(len(alone), 1)
-    return Measured(kind([known]), kind(shared), tuple(
-        kind([alone[first:first + size]]) for first in range(0, len(alone), size)),
-        len(s), noise is not None)
+    by_kind: list[tuple[type[_Known | _Shared | _Alone], list[Indices]]] = [
+        (_Known, [known]), (_Shared, shared), *(
+            (_Alone, [alone[first:first + size]]) for first in range(0, len(alone), size))]
+    parts = []
+    for of, groups in by_kind:
+        which = np.concatenate([known[:0], *groups])
+        group = np.repeat(np.arange(len(groups)), [len(each) for each in groups])
+        if len(which) and np.array_equal(which, np.arange(len(s))):
+            parts.append((of, _Kind(which, group, poses_g.columns, reading, s)))
+        elif len(which):
+            context = {key: values[which] for key, values in poses_g.columns.items()}
+            parts.append((of, _Kind(which, group, context, reading[which], s[which])))
+    return Measured(tuple(parts), len(s), 2 * len(shared), noise is not None)
 
 
 @dataclass(frozen=True)
@@ -280,21 +276,15 @@ class Equations:
 
 def equations(model: Model, poses: Measured) -> Equations:
     """Set up the equations near a model with ΔR = I; NaN where a reading's force is not unique."""
-    parts: list[_Known | _Shared | _Alone] = []
+    parts = tuple(of(model, kind) for of, kind in poses.parts)
     force, scale = np.empty((poses.count, 3)), np.empty(poses.count)
-    if len(poses.known.which):
-        parts.append(_Known(model, poses.known))
-    if len(poses.shared.which):
-        parts.append(_Shared(model, poses.shared))
-    parts += [_Alone(model, block) for block in poses.alone]
     for part in parts:
         force[part.which], scale[part.which] = part.force, part.scale
-    groups = poses.shared.group
     residual = np.concatenate([part.residual for part in parts])
-    count = len(residual) - (2 * (int(groups[-1]) + 1) if len(groups) else 0)
     return Equations(
-        parts=tuple(parts), force=force, scale=scale, count=count, noise_known=poses.noise_known,
-        residual=residual, pose=np.concatenate([part.pose for part in parts]))
+        parts=parts, force=force, scale=scale, count=len(residual) - poses.unknown,
+        noise_known=poses.noise_known, residual=residual,
+        pose=np.concatenate([part.pose for part in parts]))
 
 
 class _Alone:
@@ -360,41 +350,36 @@ class _Shared:
         self.which, self.pose = poses.which, np.repeat(poses.which, 3)
         self.scale = over_axes(poses.s)
         here = model.at(self._context)
-        self.force = unit(self._summed(here.force(poses.reading)))[self._group]
-        for _ in range(_TURNS):
-            off, tangents = self._around(here, poses.reading)
-            turn = self._normal @ self._summed(np.swapaxes(self._turn, 1, 2) @ off)
-            if np.max(np.abs(turn)) < _STRAIGHT:
+        self.force = unit(np.add.reduceat(here.force(poses.reading), self._starts))[self._group]
+        for turns in range(_TURNS + 1):
+            first = unit(np.cross(self.force, np.eye(3)[np.argmin(np.abs(self.force), axis=1)]))
+            tangents = np.stack([first, np.cross(self.force, first)], axis=2)
+            self._turn = here.slope(self.force) @ tangents / self._sigma[:, :, np.newaxis]
+            self._normal = np.linalg.inv(np.add.reduceat(
+                np.swapaxes(self._turn, 1, 2) @ self._turn, self._starts))
+            off = (poses.reading - here.reading(self.force)) / self._sigma
+            turn = self._part_of_turns(off[:, :, np.newaxis])
+            if turns == _TURNS or np.max(np.abs(turn)) < _STRAIGHT:
                 break
-            self.force = unit(self.force + (tangents @ turn[self._group])[:, :, 0])
-        off, _ = self._around(here, poses.reading)
-        self.residual = self._projected(off).ravel()
+            self.force = unit(self.force + (tangents @ turn)[:, :, 0])
+        self.residual = off.ravel() - (self._turn @ turn).ravel()
 
-    def _around(self, here: AtContext, reading: Floats) -> tuple[Floats, Floats]:
-        """Set up the turns about the common directions; return residuals and tangents."""
-        first = unit(np.cross(self.force, np.eye(3)[np.argmin(np.abs(self.force), axis=1)]))
-        tangents = np.stack([first, np.cross(self.force, first)], axis=2)
-        self._turn = here.slope(self.force) @ tangents / self._sigma[:, :, np.newaxis]
-        self._normal = np.linalg.inv(self._summed(np.swapaxes(self._turn, 1, 2) @ self._turn))
-        return ((reading - here.reading(self.force)) / self._sigma)[:, :, np.newaxis], tangents
-
-    def _summed(self, parts: Floats) -> Floats:
-        """Return the sums of (n, …) parts by group."""
-        return np.add.reduceat(parts, self._starts)
-
-    def _projected(self, rows: Floats) -> Floats:
-        """Return (n, 3, p) rows minus the part that a rotation of the direction explains."""
-        onto = self._normal @ self._summed(np.swapaxes(self._turn, 1, 2) @ rows)
-        return rows - self._turn @ onto[self._group]
+    def _part_of_turns(self, rows: Floats) -> Floats:
+        """Return the (n, 2, p) turns of the directions that explain (n, 3, p) rows best."""
+        summed = np.add.reduceat(np.swapaxes(self._turn, 1, 2) @ rows, self._starts)
+        return (self._normal @ summed)[self._group]
 
     def columns(self, model: Model | EachShape) -> Floats:
         basis = model.basis_of(model.terms.plain(self.force), self._context, self.force).full
-        rows = self._projected(basis / self._sigma[:, :, np.newaxis])
+        rows = basis / self._sigma[:, :, np.newaxis]
+        rows = rows - self._turn @ self._part_of_turns(rows)
         return rows.reshape(len(self.pose), basis.shape[2])
 
 
-def belief_in(noise_known: bool) -> float:
-    """Return the degrees of freedom that the noise counts as in a test."""
+def belief_in(noise_known: bool, dof: int = 0, chi2: float = 0.0) -> float:
+    """Return the degrees of freedom that the noise counts as, given the chi² of the poses kept."""
+    if noise_known and scipy.special.chdtrc(max(dof, 1), chi2) < _DOUBT_BELOW:
+        return _DOUBTED
     return _BELIEF if noise_known else _BELIEF_IN_USUAL
 
 
@@ -413,30 +398,20 @@ def variance_factor(chi2: float, dof: int, noise_known: bool) -> float:
     `noise_known`, and `dof` the number of equations minus that of free values.
 
     """
-    if dof <= 0:
-        return 1.0 if noise_known else _student(_BELIEF_IN_USUAL)
-    if not noise_known or chi2 > _BEYOND * dof:
-        return chi2 / dof * _student(dof)
+    if noise_known and dof <= 0:
+        return 1.0
+    if not noise_known or chi2 > _BEYOND * dof:  # Student's t
+        scale, freedom = (chi2 / dof, float(dof)) if dof > 0 else (1.0, _BELIEF_IN_USUAL)
+        limit = float(scipy.special.stdtrit(freedom, 0.5 + _INTERVAL / 2.0))
+        return scale * (limit / NORMAL_95) ** 2
     # The measured noise may be correct: a mixture over λ, with a share of `STATED_NOISE` at 1.
-    width, held = _grid()
+    width, within = _grid()
     likelihood = (chi2 * (1.0 - 1.0 / _SCALES) - dof * np.log(_SCALES)) / 2.0
     largest = np.max(likelihood)
     weight = np.exp(likelihood - largest) * (1.0 - STATED_NOISE)
     weight[_ONE] += STATED_NOISE * len(_SCALES) * np.exp(-largest)
-    part = (weight / np.sum(weight)) @ held
+    part = (weight / np.sum(weight)) @ within
     above = int(np.argmax(part >= _INTERVAL))
     share = (_INTERVAL - part[above - 1]) / (part[above] - part[above - 1])
     between = width[above - 1] * (width[above] / width[above - 1]) ** share
     return float(between / NORMAL_95) ** 2
-
-
-def _student(dof: float) -> float:
-    """Return the squared ratio of the 95 % intervals of Student's t and a normal variable."""
-    return float(scipy.special.stdtrit(dof, 0.5 + _INTERVAL / 2.0) / NORMAL_95) ** 2
-
-
-def belief_beside(dof: int, chi2: float, noise_known: bool) -> float:
-    """Return the degrees of freedom that the noise counts as, given the chi² of the poses kept."""
-    if noise_known and scipy.special.chdtrc(max(dof, 1), chi2) < _DOUBT_BELOW:
-        return _DOUBTED
-    return belief_in(noise_known)

@@ -153,14 +153,11 @@ def left_out(residual: Floats, basis: Floats, pose: Indices, force: Floats, leas
 def by_pose(residual: Floats, columns: Floats, pose: Indices,
             prior: Floats | None = None) -> ByPose:
     """Return (m,) residuals and (m, q) columns by pose, given the (m,) pose of each equation."""
-    rows = np.bincount(pose)
-    count = len(rows)
-    if len(pose) == count:
-        order = slice(None) if np.all(pose[:-1] < pose[1:]) else np.argsort(pose)
+    rows, order = np.bincount(pose), np.argsort(pose, kind='stable')
+    if len(pose) == len(rows):
         return ByPose(residual[order][:, np.newaxis], columns[order][:, np.newaxis], rows, prior)
-    order = np.argsort(pose, kind='stable')
     slot = np.arange(len(pose)) - np.repeat(np.cumsum(rows) - rows, rows)
-    by_row = np.zeros((count, int(rows.max())))
+    by_row = np.zeros((len(rows), int(rows.max())))
     derivative = np.zeros((*by_row.shape, columns.shape[1]))
     by_row[pose[order], slot] = residual[order]
     derivative[pose[order], slot] = columns[order]
@@ -281,8 +278,7 @@ class Fit:
         if self.prior is not None:
             columns, size = _scaled(np.vstack([columns * size, self.prior.columns]))
         factor = self.ties @ (np.linalg.pinv(columns) / size[:, np.newaxis])
-        spread: Floats = factor @ factor.T
-        return spread * self.variance_factor
+        return np.asarray(factor @ factor.T * self.variance_factor)
 
     @property
     def variance_factor(self) -> float:
@@ -299,14 +295,9 @@ def _scaled(columns: Floats) -> tuple[Floats, Floats]:
     return columns / size, size
 
 
-def free_of(model: Model) -> Floats:
-    """Return the (p, q) matrix from the fitted values of a model to all its values."""
-    return np.eye(len(model.fitted))[:, model.fitted]
-
-
 def judge(model: Model, poses_g: Poses, ties: Floats | None = None) -> Fit:
     """Return a model at poses without a fit; by default all values that a fit changes are free."""
-    ties = free_of(model) if ties is None else ties
+    ties = np.eye(len(model.fitted))[:, model.fitted] if ties is None else ties
     near = equations(model, measured(poses_g))
     return Fit(model, poses_g, near, near.columns(model) @ ties, ties)
 
@@ -348,11 +339,6 @@ class Point:
         return np.dot(self.columns.T, self.columns)
 
     @cached_property
-    def downhill(self) -> Floats:
-        """(q,) array, Jᵀ times the residuals."""
-        return self.columns.T @ self.residual
-
-    @cached_property
     def cost(self) -> float:
         """Sum of the squared residuals; infinite if it or JᵀJ is not finite."""
         cost = float(np.dot(self.residual, self.residual))
@@ -371,72 +357,54 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
     `_MOST_STEPS` steps, or as soon as it cannot lower the cost to `most`.
 
     """
-    def tried_at(values: Floats) -> Point:
-        with np.errstate(all='ignore'):
-            try:
-                return point_at(values)
-            except np.linalg.LinAlgError:
-                return Point(np.array([np.inf]), np.zeros((1, len(values))))
-
     values = np.clip(start, lower, upper)
-    now, damping = tried_at(values), 0.0
+    now, damping = _try(point_at, values), 0.0
     held = np.zeros(len(values), bool)
     first = _FIRST_DAMPING * now.singular
     if not np.isfinite(now.cost):
         raise NotConvergedError
-    for _ in range(_MOST_STEPS):
-        held, damping = _held(now, held, damping)
-        free = _free(values, now, lower, upper) & ~held
-        full, fall = _step(now, free, 0.0)
-        if fall <= _NEAR * now.cost or fall < _ROUNDING or damping > _LARGEST_DAMPING:
+    for steps in range(_MOST_STEPS + 1):
+        pull = now.columns.T @ now.residual
+        free = ~(held | ((values <= lower) & (pull < 0.0)) | ((values >= upper) & (pull > 0.0)))
+        size = np.sqrt(np.diag(now.normal))
+        weight = free / np.where(size == 0.0, 1.0, size)
+        # The step along the axes of the scaled JᵀJ is 0 along those that are not determined.
+        scales, axes = np.linalg.eigh(now.normal * weight * weight[:, np.newaxis])
+        determined = scales > now.singular * scales[-1]
+        scales = np.where(determined, scales, 1.0)
+        downhill = np.where(determined, axes.T @ (pull * weight), 0.0)
+        fall = float(downhill / scales @ downhill)  # that the cost is predicted to have
+        spare = max(len(now.residual) - len(values), 1)
+        is_near = fall <= _NEAR_ENOUGH * now.cost / spare + _ROUNDING
+        if (fall <= _NEAR * now.cost or fall < _ROUNDING or damping > _LARGEST_DAMPING
+                or steps == _MOST_STEPS):
             break
         if now.cost - _HOPE * fall > most:
             raise NotConvergedError
-        step = full if damping == 0.0 else _step(now, free, damping)[0]
-        moved = np.clip(move(values, step), lower, upper)
-        tried = tried_at(moved)
+        moved = np.clip(move(values, axes @ (downhill / (scales + damping)) * weight),
+                        lower, upper)
+        tried = _try(point_at, moved)
         if tried.cost < now.cost:
             values, now, damping = moved, tried, damping / 10.0
             damping = 0.0 if damping < first else damping
-        elif damping > 0.0 and _is_near(now, fall):  # a kink, or rounding
+        elif damping > 0.0 and is_near:  # a kink, or rounding
             break
         else:
             damping = max(10.0 * damping, first)
-    if not _is_near(now, _step(now, _free(values, now, lower, upper) & ~held, 0.0)[1]):
+            if now.kinked is not None and damping > _AT_A_KINK and np.any(held != now.kinked):
+                held, damping = now.kinked, 0.0
+    if not is_near:
         raise NotConvergedError
     return values, now
 
 
-def _held(now: Point, held: NDArray[np.bool_], damping: float
-          ) -> tuple[NDArray[np.bool_], float]:
-    """Return the values that are held, at a kink those of `Point.kinked`, and the damping."""
-    if now.kinked is None or damping <= _AT_A_KINK or np.all(held == now.kinked):
-        return held, damping
-    return now.kinked, 0.0
-
-
-def _is_near(now: Point, fall: float) -> bool:
-    """Return whether the predicted fall of the cost is negligible beside the noise."""
-    spare = max(len(now.residual) - len(now.downhill), 1)
-    return fall <= _NEAR_ENOUGH * now.cost / spare + _ROUNDING
-
-
-def _free(values: Floats, now: Point, lower: Floats, upper: Floats) -> NDArray[np.bool_]:
-    """Return which values are free: not at a bound beyond which the cost would decrease."""
-    held = (((values <= lower) & (now.downhill < 0.0))
-            | ((values >= upper) & (now.downhill > 0.0)))
-    return ~held
-
-
-def _step(now: Point, free: NDArray[np.bool_], damping: float) -> tuple[Floats, float]:
-    """Return the damped step, 0 along undetermined values, and the predicted fall of the cost."""
-    size = np.sqrt(np.diag(now.normal))
-    weight = free / np.where(size == 0.0, 1.0, size)
-    scales, axes = np.linalg.eigh(now.normal * weight * weight[:, np.newaxis])
-    downhill = axes.T @ (now.downhill * weight)
-    determined = scales > now.singular * scales[-1]
-    along = np.where(determined, downhill, 0.0) / (np.where(determined, scales, 1.0) + damping)
-    return axes @ along * weight, float(along @ downhill)
+@np.errstate(all='ignore')
+def _try(point_at: Callable[[Floats], Point], values: Floats) -> Point:
+    """Return the point at values; one of infinite cost if they have no solution."""
+    try:
+        return point_at(values)
+    except np.linalg.LinAlgError:
+        return Point(np.array([np.inf]), np.zeros((1, len(values))))
 
 
 @dataclass(frozen=True)
@@ -450,11 +418,6 @@ class Prior:
     def root(self) -> Floats:
         """Return L, (9, 9), with L Lᵀ the covariance."""
         return np.linalg.cholesky(self.covariance)
-
-    @cached_property
-    def whitening(self) -> Floats:
-        """Return L⁻¹, (9, 9), which converts deviations to independent units."""
-        return np.linalg.inv(self.root)
 
 
 def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
@@ -480,30 +443,27 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
     fitted, vector, poses = start.fitted, start.vector.copy(), measured(poses_g)
     kinked = np.array([effect.own and part in effect.shape for effect in start.terms.effects
                        for part in effect.values], bool)[fitted]
-    weight = np.sqrt(1.0 if factor is None else factor)
-
-    def model_at(values: Floats) -> Model:
-        vector[fitted] = values
-        return with_vector(start.effects, vector.copy())
 
     def point_at(values: Floats) -> Point:
-        model = model_at(values)
+        vector[fitted] = values
+        model = with_vector(start.effects, vector.copy())
         near = equations(model, poses)
         columns = near.columns(model)[:, fitted]
         if prior is None:
-            return Point(near.residual, columns, near, kinked=kinked)
-        rows = prior.whitening * weight
+            return Point(near.residual, columns, (model, near), kinked=kinked)
+        rows = np.linalg.inv(prior.root) * np.sqrt(factor or 1.0)
         return Point(np.concatenate([near.residual, rows @ (prior.mean - values)]),
-                     np.vstack([columns, rows]), near, _SINGULAR_WITH_PRIOR)
+                     np.vstack([columns, rows]), (model, near), _SINGULAR_WITH_PRIOR)
 
     lower, upper = _bounds(start, poses_g)
     lower, upper = lower[fitted], upper[fitted]
     values, found = solve(point_at, start.vector[fitted], lower, upper,
                           move=np.add if prior is None else along_quadrics, most=most)
     at_bound = bool(np.any((values <= lower) | (values >= upper)))
-    count = len(found.source.residual)
+    model, near = found.source
+    count = len(near.residual)
     own = None if prior is None else Point(found.residual[count:], found.columns[count:])
-    return Fit(model_at(values), poses_g, found.source, found.columns[:count], free_of(start),
+    return Fit(model, poses_g, near, found.columns[:count], np.eye(len(fitted))[:, fitted],
                at_bound=at_bound, prior=own, factor=factor)
 
 

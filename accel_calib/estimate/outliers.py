@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Fits without outliers, and mistakes in poses that the other poses do not locate or show.
+Fits without outliers or beside a scatter, and mistakes that the other poses do not locate or show.
 
 The pose with the largest residual against a fit of the other poses (externally studentised, with
 the moderated variance of `accel_calib.estimate.fit.Fit`) is removed, and so on, several times. The
@@ -28,11 +28,24 @@ over the poses that are kept, with their noise s. The noise counts as f degrees 
 is a row whose hypothesis is at least `LEVEL` times as probable as that of the row left out. The
 covariance of a fit with rivals includes the difference to the fit of each rival.
 
-**Scatter.** Poses that repeat worse than their samples are no outliers. Few poses hardly tell a
-mistake of one from a scatter of all, but a test with the measured noise finds a mistake in both
-cases. With each outlier a mistake of up to 0.1 g of 2 % of the poses, outliers are only left out
-if the likelihood of a scatter of all poses (`.scatter`), or of a factor on their noise, is not far
-larger.
+**Scatter.** Poses that repeat worse than their samples are no outliers: they have a variance in
+common. The noise of a mean falls with the number of samples, but what differs from pose to pose
+does not: the sensor settles, warms up, is pressed against the table. With σ the noise of the mean,
+the variance of a reading is then σ² + τ² with one τ for all poses, and not λ σ² as in
+`.equations`. If the noise of the poses differs, the quiet ones would have far too much weight.
+Both hypotheses are judged by the restricted likelihood (Patterson and Thompson 1971). With e the
+residuals, B the derivatives by the values [g], and W the inverse of the variances, twice its
+negative logarithm is
+
+    log |W⁻¹| + log |BᵀWB| + min_k (e - B k)ᵀW (e - B k)
+
+λ is at least 1. τ relative to the median noise, and √(λ - 1), have the prior of Cauchy (Gelman
+2006): a scatter of more than a few times the noise is less probable.
+
+Few poses hardly tell a mistake of one from a scatter of all, but a test with the measured noise
+finds a mistake in both cases. With each outlier a mistake of up to 0.1 g of 2 % of the poses,
+outliers are only left out if the likelihood of a scatter of all poses, or of a factor on their
+noise, is not far larger.
 
 **Unchecked rows.** A pose with a leverage near 1 pulls the fit towards itself, so that its mistake
 does not show. The largest mistake that the test for outliers does not find is
@@ -42,6 +55,7 @@ deviations.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 import math
 from typing import NamedTuple
 
@@ -50,9 +64,8 @@ from numpy.typing import NDArray
 import scipy
 
 from .closed_form import agreeing, start_of
-from .equations import belief_beside, belief_in
+from .equations import belief_in
 from .fit import estimate, Fit, judge, NotConvergedError
-from .scatter import beside_scatter, enough, scatter_of
 from ..effects import MODELS, parameter_names
 from ..table import Poses
 from ..units import Floats, Indices
@@ -102,6 +115,22 @@ strong)."""
 _ALIKE = 0.02
 """Relative change of a scatter after which it is found."""
 
+_POSITIVE = 2.0
+"""Smallest evidence for a scatter (Kass and Raftery 1995: positive)."""
+
+_USUAL = 3.0
+"""Scale of the prior of τ, relative to the median noise, and of √(λ - 1)."""
+
+_TRIED = np.arange(-7.0, 7.1, 0.25)
+"""Logarithms of τ relative to the median noise, and of √(λ - 1), that are tried. Between them, the
+deviance is nearly a parabola."""
+
+_NO_SIZE = 1e-12
+"""Relative singular value below which columns have no direction of their own."""
+
+_ENOUGH = 1000
+"""Number of poses from which τ is estimated; more are not needed."""
+
 _LARGEST_LOG = 100.0
 """Largest logarithm of odds, against overflow."""
 
@@ -110,6 +139,94 @@ _HARDLY = 0.1
 
 _ALONE = 1e-9
 """1 - leverage below this: the pose alone determines a parameter."""
+
+
+class Scatter(NamedTuple):
+    """
+    The size of a scatter τ [g], 0 if there is none, and how well it explains the residuals.
+
+    `deviance` is twice the negative logarithm of its likelihood, and `without` that of λ.
+
+    """
+
+    size_g: float
+    deviance: float
+    without: float
+
+    @property
+    def evidence(self) -> float:
+        """Return twice the logarithm of the ratio of the likelihoods of τ and λ."""
+        return self.without - self.deviance
+
+    @property
+    def shows(self) -> bool:
+        return self.evidence > _POSITIVE
+
+
+def beside_scatter(poses_g: Poses, size_g: float) -> Poses:
+    """Return poses with a scatter [g] in addition to their noise."""
+    return poses_g.with_columns(own_scatter=np.full(poses_g.reading.shape, size_g))
+
+
+def with_scatter_of(fit: Fit, poses_g: Poses) -> Poses:
+    """Return poses with the scatter that those of a fit state; unchanged if they state none."""
+    if 'own_scatter' not in fit.poses_g:
+        return poses_g
+    return beside_scatter(poses_g, float(fit.poses_g['own_scatter'][0, 0]))
+
+
+def enough(count: int) -> NDArray[np.bool_]:
+    """Return which of `count` poses suffice for a scatter."""
+    return np.arange(count) % max(-(-count // _ENOUGH), 1) == 0
+
+
+def scatter_of(fit: Fit, among: NDArray[np.bool_] | None = None) -> Scatter:
+    """
+    Return the scatter of the poses of a fit; none if their noise is not known.
+
+    It is estimated from the poses `among` them, (n,); fits are only compared by the same poses.
+
+    """
+    among = enough(len(fit.poses_g)) if among is None else among
+    few = among[fit.equations.pose]
+    sigma = fit.equations.scale[fit.equations.pose[few]]
+    basis, sizes, _ = np.linalg.svd(fit.columns[few] * sigma[:, np.newaxis], full_matrices=False)
+    onto = basis[:, sizes > _NO_SIZE * np.max(sizes, initial=0.0)]
+    count = len(sigma) - onto.shape[1]
+    if not fit.noise_known or count < 1:
+        return Scatter(0.0, 0.0, 0.0)
+    middle = float(np.median(sigma))
+    more = np.append(0.0, (middle * np.exp(_TRIED)) ** 2)
+    # The (r,) logarithms of the determinants, and weighted squares, of the module: from the (m,)
+    # residual and an orthonormal basis (m, q) of the derivatives [g], and (r, m) variances.
+    residual = fit.residual[few] * sigma
+    variance = sigma ** 2 + more[:, np.newaxis]
+    weight, width = 1.0 / variance, onto.shape[1]
+    products = (onto[:, :, np.newaxis] * onto[:, np.newaxis]).reshape(len(onto), width ** 2)
+    normal = (weight @ products).reshape(len(weight), width, width)
+    side = (residual * weight) @ onto
+    explained = np.sum(side * np.linalg.solve(normal, side[..., np.newaxis])[..., 0], axis=1)
+    size = np.sum(np.log(variance), axis=1) + np.linalg.slogdet(normal)[1]
+    squares = weight @ residual ** 2 - explained
+    nothing = float(size[0] + squares[0])
+    if squares[0] <= count:
+        return Scatter(0.0, nothing, nothing)
+    prior = 2.0 * np.log1p((np.exp(_TRIED) / _USUAL) ** 2)
+    factor = 1.0 + np.exp(2.0 * _TRIED)
+    without = _find_lowest(size[0] + count * np.log(factor) + squares[0] / factor + prior)[1]
+    log, least = _find_lowest(size[1:] + squares[1:] + prior)
+    return Scatter(middle * float(np.exp(log)), least, min(nothing, without))
+
+
+def _find_lowest(deviance: Floats) -> tuple[float, float]:
+    """Return where in `_TRIED` a deviance is lowest, and its value there."""
+    at = int(np.clip(np.argmin(deviance), 1, len(deviance) - 2))
+    before, here, after = deviance[at - 1:at + 2]
+    slope, bend = (after - before) / 2.0, max(before - 2.0 * here + after, 1e-12)
+    shift = float(np.clip(-slope / bend, -1.0, 1.0))
+    step = float(_TRIED[1] - _TRIED[0])
+    return (float(_TRIED[at]) + shift * step,
+            float(here + slope * shift + bend * shift ** 2 / 2.0))
 
 
 def outliers_among(residual: Floats, basis: Floats, rows: Indices, dof: Sequence[int], total: int,
@@ -124,12 +241,13 @@ def outliers_among(residual: Floats, basis: Floats, rows: Indices, dof: Sequence
 
     """
     most, out = int(rows.max()), total - len(rows)
-    limits = [_limit(each + most * out, total, most) - out for each in dof]
-    if max(limits) <= 0:
+    limits = [max(min(int(LARGEST_SHARE * total), (each + most * out) // (2 * most)) - out, 0)
+              for each in dof]
+    if max(limits) == 0:
         return [np.zeros(0, np.intp)] * len(dof)
-    own = np.eye(residual.shape[2]) - basis @ basis.swapaxes(2, 3)
+    own, found = np.eye(residual.shape[2]) - basis @ basis.swapaxes(2, 3), []
     if len(rows) > _MANY:  # all at once, relative to the median
-        found, belief = [], belief_in(noise_known)
+        belief = belief_in(noise_known)
         usual = np.where(rows == 1, _MEDIAN_OF_CHI2[1], _MEDIAN_OF_CHI2[3]) / rows
         for k, limit in enumerate(limits):
             squared = _squared(residual[k], own[k]) / rows
@@ -138,57 +256,35 @@ def outliers_among(residual: Floats, basis: Floats, rows: Indices, dof: Sequence
             least = scipy.special.fdtri(np.arange(1, most + 1), max(belief + dof[k], 1.0),
                                         1.0 - LEVEL / len(rows))
             extreme = np.flatnonzero(ratio > least[rows - 1])
-            largest = np.argsort(-ratio[extreme], kind='stable')[:max(limit, 0)]
+            largest = np.argsort(-ratio[extreme], kind='stable')[:limit]
             found.append(np.sort(extreme[largest]))
         return found
     flat = basis.reshape(len(basis), residual[0].size, -1)
     beside = residual.reshape(len(flat), -1, 1)
     residual = (beside - flat @ (flat.swapaxes(1, 2) @ beside)).reshape(residual.shape)
-    pose, size = _removed_in_turn(residual, basis, own, rows, max(limits))
+    poses, sizes = _remove_in_turn(residual, basis, own, rows, max(limits))
     whole = np.sum(residual ** 2, axis=(1, 2))
-    return [_extreme(pose[k, :limit], size[k, :limit], rows, float(whole[k]), dof[k],
-                     noise_known=noise_known) for k, limit in enumerate(limits)]
+    for k, limit in enumerate(limits):
+        pose, size, count, belief = poses[k, :limit], sizes[k, :limit], 0, belief_in(noise_known)
+        removed = np.cumsum(rows[pose])
+        rss = np.maximum(whole[k] - np.cumsum([0.0, *size]), 0.0)  # before each, and at the end
+        for _ in range(2):
+            left = np.maximum(belief + dof[k] - removed, 1e-9)
+            others = np.maximum(belief + rss[:-1] - size, 1e-300) / left
+            chance = scipy.special.fdtrc(rows[pose], np.maximum(left, 1.0),
+                                         size / rows[pose] / others)
+            rare = np.flatnonzero(chance < LEVEL / (len(rows) - np.arange(limit)))
+            count = int(rare[-1]) + 1 if len(rare) else 0
+            if not count:
+                break
+            # Again, with the belief that the poses left support.
+            belief = belief_in(noise_known, dof[k] - int(removed[count - 1]), rss[count])
+        found.append(np.sort(pose[:count]))
+    return found
 
 
-def _limit(spare: int, total: int, rows: int) -> int:
-    """Return the largest number of poses to leave out, each with `rows` equations."""
-    return max(min(int(LARGEST_SHARE * total), spare // (2 * rows)), 0)
-
-
-def _extreme(pose: Indices, size: Floats, rows: Indices, whole: float, dof: int, *,
-             noise_known: bool) -> Indices:
-    """
-    Return the outliers among the (k,) indices of poses that were removed in turn.
-
-    `size` (k,) is the squared residual of each against the others, in units of its variance.
-    `rows` (n,) are the numbers of equations of all poses, `whole` the sum of squared residuals and
-    `dof` those of the start.
-
-    """
-    removed = np.cumsum(rows[pose])
-    rss = np.maximum(whole - np.cumsum([0.0, *size]), 0.0)  # before each removal, and at the end
-
-    def count(belief: float) -> int:
-        left = np.maximum(belief + dof - removed, 1e-9)
-        others = np.maximum(belief + rss[:-1] - size, 1e-300) / left
-        chance = beyond(size / rows[pose] / others, rows[pose], left)
-        found = np.flatnonzero(chance < LEVEL / (len(rows) - np.arange(len(pose))))
-        return int(found[-1]) + 1 if len(found) else 0
-
-    extreme = count(belief_in(noise_known))
-    if extreme:
-        left = dof - int(removed[extreme - 1])
-        extreme = count(belief_beside(left, rss[extreme], noise_known))
-    return np.sort(pose[:extreme])
-
-
-def beyond(ratio: Floats, rows: Indices, dof: Floats | float) -> Floats:
-    """Return the probability of a larger ratio of variances by chance (F distribution)."""
-    return scipy.special.fdtrc(rows, np.maximum(dof, 1.0), ratio)
-
-
-def _removed_in_turn(residual: Floats, basis: Floats, own: Floats, rows: Indices, most: int
-                     ) -> tuple[Indices, Floats]:
+def _remove_in_turn(residual: Floats, basis: Floats, own: Floats, rows: Indices, most: int
+                    ) -> tuple[Indices, Floats]:
     """
     Remove the most extreme pose repeatedly, and update each fit to first order.
 
@@ -235,32 +331,19 @@ def _squared(residual: Floats, own: Floats) -> Floats:
     return np.sum(along ** 2 / np.where(size > _LEAST_OWN, size, np.inf), axis=-1)
 
 
-def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
+def fit_robust(name: str, poses_g: Poses, determined: Callable[[Poses], bool] = lambda left: True
+               ) -> tuple[Fit, Indices]:
     """
-    Fit model 4, 7 or 10 to poses in g of unknown orientation, without the outliers.
-
-    Return as `outliers_or_scatter`. The poses are at least as many as free parameters. Raise
-    `NotConvergedError` if they are not on an ellipsoid.
-
-    """
-    return outliers_or_scatter(
-        poses_g, lambda poses: _fit_norm(name, poses),
-        lambda poses: estimate(start_of(name, poses.reading), poses))
-
-
-def outliers_or_scatter(poses_g: Poses, without: Callable[[Poses], tuple[Fit, Indices]],
-                        whole: Callable[[Poses], Fit]) -> tuple[Fit, Indices]:
-    """
-    Fit poses in g without the outliers, or beside a scatter that all of them have.
+    Fit a model to poses in g without the outliers, or beside a scatter that all of them have.
 
     Parameters
     ----------
+    name : {'4', '7', '10', '12'}
+        The model; 12 is for known orientations, and the others for unknown ones.
     poses_g : Poses
-        All poses, with the same number of equations each.
-    without : callable
-        Fits poses without the outliers; returns the fit and the indices of the poses used.
-    whole : callable
-        Fits all poses. Both may raise `NotConvergedError`.
+        All poses, at least as many as determine the model.
+    determined : callable
+        Whether poses that are left determine the model; others are not left out.
 
     Returns
     -------
@@ -268,57 +351,56 @@ def outliers_or_scatter(poses_g: Poses, without: Callable[[Poses], tuple[Fit, In
         The fit, and the indices of the poses used. If they scatter beyond their noise, those of
         the fit state it (``own_scatter``).
 
+    Raises
+    ------
+    NotConvergedError
+        If the poses are not on an ellipsoid.
+
     """
-    found, everyone = without(poses_g), np.arange(len(poses_g))
+    found = _without_outliers(name, poses_g, determined)
     if not found[0].noise_known:
         return found
-    best, least = _with_scatter(poses_g, without, *found)
-    if len(found[1]) == len(poses_g):
+    best, least = _with_scatter(name, poses_g, determined, found)
+    if len(found[1]) == len(poses_g) or (whole := _fit(name, poses_g)) is None:
         return best
-    try:
-        fit = whole(poses_g)
-    except NotConvergedError:
-        return best
-    of_all, deviance = _with_scatter(poses_g, without, fit, everyone)
+    everyone = np.arange(len(poses_g))
+    of_all, deviance = _with_scatter(name, poses_g, determined, (whole, everyone))
     return of_all if deviance < least - _STRONG else best
 
 
-def _with_scatter(poses_g: Poses, without: Callable[[Poses], tuple[Fit, Indices]], fit: Fit,
-                  kept: Indices) -> tuple[tuple[Fit, Indices], float]:
+def _with_scatter(name: str, poses_g: Poses, determined: Callable[[Poses], bool],
+                  best: tuple[Fit, Indices]) -> tuple[tuple[Fit, Indices], float]:
     """Return a fit, or that beside the scatter of its poses if it is better, and its deviance."""
-    few = enough(len(poses_g))
+    (fit, kept), few = best, enough(len(poses_g))
+    of_outlier = -2.0 * (math.log(_KNOCKED) + int(fit.by_pose.rows[0]) * math.log(
+        math.sqrt(2.0 * math.pi) / _LARGEST_G))
     scatter = scatter_of(fit, few[kept])
-    best, least = (fit, kept), scatter.without + _of_outliers(fit, kept, few)
+    least = scatter.without + of_outlier * np.count_nonzero(np.delete(few, kept))
     for _ in range(_ROUNDS):
         if not scatter.shows:
             return best, least
         size = scatter.size_g
         try:
-            fit, kept = without(beside_scatter(poses_g, size))
+            fit, kept = _without_outliers(name, beside_scatter(poses_g, size), determined)
         except NotConvergedError:
             return best, least
         scatter = scatter_of(judge(fit.model, poses_g.take(kept)), few[kept])
         if abs(scatter.size_g - size) <= _ALIKE * size:
             break
-    deviance = scatter.deviance + _of_outliers(fit, kept, few)
+    deviance = scatter.deviance + of_outlier * np.count_nonzero(np.delete(few, kept))
     return ((fit, kept), deviance) if scatter.shows and deviance < least else (best, least)
 
 
-def _of_outliers(fit: Fit, kept: Indices, few: NDArray[np.bool_]) -> float:
-    """Return the deviance of the outliers among few poses: those that a fit does not keep."""
-    each = math.log(_KNOCKED) + int(fit.by_pose.rows[0]) * math.log(
-        math.sqrt(2.0 * math.pi) / _LARGEST_G)
-    return -2.0 * each * (np.count_nonzero(few) - np.count_nonzero(few[kept]))
-
-
-def _fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
-    everyone = np.arange(len(poses_g))
-    direct = _without_outliers(name, poses_g, everyone)
-    if direct is not None and direct[0].chi2 <= _SUSPICIOUS * max(direct[0].dof, 1):
-        return direct
-    most = _most(name, len(poses_g))
-    robust = None if most < 1 else _with_those_that_agree(
-        name, poses_g, agreeing(name, poses_g, most))
+def _without_outliers(name: str, poses_g: Poses, determined: Callable[[Poses], bool]
+                      ) -> tuple[Fit, Indices]:
+    """Fit a model without the outliers, even if they distort the fit of all poses."""
+    everyone, form = np.arange(len(poses_g)), MODELS[name]
+    spare = len(poses_g) - len(parameter_names(form.effects))
+    most = min(int(LARGEST_SHARE * len(poses_g)), spare // 2)
+    direct, robust = _leave_out(name, poses_g, everyone, most, determined), None
+    suspicious = direct is None or direct[0].chi2 > _SUSPICIOUS * max(direct[0].dof, 1)
+    if suspicious and most > 0 and not form.known_orientation:
+        robust = _with_those_that_agree(name, poses_g, agreeing(name, poses_g, most), most)
     if robust is None:
         if direct is None:
             raise NotConvergedError
@@ -329,8 +411,27 @@ def _fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
     for count in range(len(gross) + 1):
         if found is not None and found[0].variance <= _CLEARLY * robust[0].variance:
             return found
-        found = _without_outliers(name, poses_g, np.setdiff1d(everyone, gross[:count + 1]))
+        left = np.setdiff1d(everyone, gross[:count + 1])
+        found = _leave_out(name, poses_g, left, most, determined)
     return robust
+
+
+def _leave_out(name: str, poses_g: Poses, kept: Indices, most: int,
+               determined: Callable[[Poses], bool]) -> tuple[Fit, Indices] | None:
+    """Fit poses and leave out outliers until there are none; None if a fit does not converge."""
+    fit = _fit(name, poses_g.take(kept))
+    for _ in range(_ROUNDS):
+        if fit is None or not len(out := outliers(fit, len(poses_g))):
+            break
+        left = np.delete(kept, out)
+        if not determined(poses_g.take(left)):
+            break
+        fit, kept = _fit(name, poses_g.take(left)), left
+    if fit is None:
+        return None
+    if len(kept) == len(poses_g) or MODELS[name].known_orientation:
+        return fit, kept
+    return _with_those_that_agree(name, poses_g, kept, most) or (fit, kept)
 
 
 def outliers(fit: Fit, total: int) -> Indices:
@@ -340,56 +441,34 @@ def outliers(fit: Fit, total: int) -> Indices:
                           total, noise_known=fit.noise_known)[0]
 
 
-def _without_outliers(name: str, poses_g: Poses, kept: Indices
-                      ) -> tuple[Fit, Indices] | None:
-    """Fit poses and leave out outliers until there are none; None if a fit does not converge."""
-    fit = _fit(name, poses_g, kept)
-    for _ in range(_ROUNDS):
-        if fit is None or not len(out := outliers(fit, len(poses_g))):
-            break
-        kept = np.delete(kept, out)
-        fit = _fit(name, poses_g, kept)
-    if fit is None:
-        return None
-    if len(kept) < len(poses_g):
-        return _with_those_that_agree(name, poses_g, kept) or (fit, kept)
-    return fit, kept
-
-
-def _with_those_that_agree(name: str, poses_g: Poses, kept: Indices
+def _with_those_that_agree(name: str, poses_g: Poses, kept: Indices, most: int
                            ) -> tuple[Fit, Indices] | None:
-    """Include the poses that agree with a fit, leave out the others; None if too few agree."""
+    """Include the poses that agree with a fit; None if more than `most` do not."""
     tried: set[bytes] = set()
-    while (fit := _fit(name, poses_g, kept)) is not None:
+    while (fit := _fit(name, poses_g.take(kept))) is not None:
         tried.add(kept.tobytes())
         data = judge(fit.model, poses_g).by_pose
         leverage = np.einsum('nkp,pq,nkq->n', data.columns, fit.by_pose.spread, data.columns)
         inside = np.isin(np.arange(len(poses_g)), kept)
         spare = np.where(inside, np.maximum(1.0 - leverage, 1e-6), 1.0 + leverage)
-        belief = belief_beside(fit.dof, fit.chi2, fit.noise_known)
+        belief = belief_in(fit.noise_known, fit.dof, fit.chi2)
         size = data.residual[:, 0] ** 2 / spare / ((belief + fit.chi2) / (belief + fit.dof))
-        agreeing = np.flatnonzero(
-            beyond(size, data.rows, belief + fit.dof) >= LEVEL / len(poses_g))
-        if len(poses_g) - len(agreeing) > _most(name, len(poses_g)):
+        chance = scipy.special.fdtrc(data.rows, max(belief + fit.dof, 1.0), size)
+        agree = np.flatnonzero(chance >= LEVEL / len(poses_g))
+        if len(poses_g) - len(agree) > most:
             return None
-        if agreeing.tobytes() in tried or len(tried) == _ROUNDS:
+        if agree.tobytes() in tried or len(tried) == _ROUNDS:
             return fit, kept
-        kept = agreeing
+        kept = agree
     return None
 
 
-def _fit(name: str, poses_g: Poses, kept: Indices) -> Fit | None:
-    now = poses_g.take(kept)
+def _fit(name: str, poses_g: Poses) -> Fit | None:
+    """Fit a model to all of these poses; None if the fit does not converge."""
     try:
-        return estimate(start_of(name, now.reading), now)
+        return estimate(start_of(name, poses_g.reading), poses_g)
     except NotConvergedError:
         return None
-
-
-def _most(name: str, count: int) -> int:
-    """Return the largest number of poses that can be left out."""
-    free = len(parameter_names(MODELS[name].effects))
-    return _limit(count - free, count, 1)
 
 
 class Rival(NamedTuple):
@@ -415,18 +494,17 @@ def rivals(fit: Fit, kept: Indices, out: Indices, poses_g: Poses,
     those left out. `refit` fits the same model to other poses, and may raise `NotConvergedError`.
 
     """
-    found = []
-    belief = belief_beside(fit.dof, fit.chi2, fit.noise_known)
+    found: list[Rival] = []
+    belief = belief_in(fit.noise_known, fit.dof, fit.chi2)
+    probable = _log_probability(fit, belief)
     for wrong, instead in _look_alikes(fit, kept, out, poses_g):
         others = np.union1d(np.setdiff1d(kept, [instead]), [wrong])
-        try:
+        with suppress(NotConvergedError):
             rival = refit(poses_g.take(others))
-        except NotConvergedError:
-            continue
-        difference = _log_probability(rival, belief) - _log_probability(fit, belief)
-        odds = float(np.exp(min(difference, _LARGEST_LOG)))
-        if odds >= LEVEL:
-            found.append(Rival(wrong, instead, rival, odds))
+            difference = _log_probability(rival, belief) - probable
+            odds = float(np.exp(min(difference, _LARGEST_LOG)))
+            if odds >= LEVEL:
+                found.append(Rival(wrong, instead, rival, odds))
     return tuple(found)
 
 

@@ -65,7 +65,7 @@ def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> R
                 f'{100.0 * quality.coverage:.0f} % of the sphere']
     named = [*_find_missing(expected, refinement)]
     error = expected.inexact_mg if named else expected.error_mg
-    own = [*_find_failures(expected, refinement), *_find_wild_figures(expected, refinement),
+    own = [*_find_failures(expected, refinement), *_find_implausible(expected, refinement),
            *_find_limits(expected), *_find_unchecked(expected), *named,
            *_find_inexact(expected, error, refinement)]
     noted = without(calibration.noted, *(each.kind for each in own))
@@ -91,7 +91,7 @@ def _find_failures(expected: Expected, refinement: Refinement | None) -> Iterato
                       'USABLE', **_remedy(expected, refinement))
 
 
-def _find_wild_figures(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
+def _find_implausible(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
     """Yield a finding for each figure of the first line that no useful calibration has."""
     quality = expected.quality
     held_out, noise = quality.held_out_rms_mg, quality.noise_floor_mg

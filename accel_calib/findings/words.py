@@ -232,16 +232,13 @@ def _curve_words(figures: Mapping[str, Any]) -> str:
                     if nearest else '')
 
 
-def _range_words(figures: Mapping[str, Any]) -> str:
-    column, (low, high) = figures['column'], figures['range']
-    low_mg, high_mg = figures['ends_mg']
-    span = f'{low:.4g} to {high:.4g} {unit_of(column)}'.rstrip()
-    return (f'over {column.replace("_", " ")} {span}: {low_mg:.2g} mg RMS in the lowest fifth of '
-            f'the poses, {high_mg:.2g} mg in the highest')
-
-
 _PLACES: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
-    'curve': _curve_words, 'range': _range_words,
+    'curve': _curve_words,
+    'range': lambda of: (
+        f'over {of["column"].replace("_", " ")} '
+        + '{:.4g} to {:.4g}'.format(*of['range']) + f' {unit_of(of["column"])}'.rstrip()
+        + ': {:.2g} mg RMS in the lowest fifth of the poses, {:.2g} mg in the highest'.format(
+            *of['ends_mg'])),
     'instant': lambda of: (
         'between {:.6g} and {:.6g} s (rows {} and {})'.format(*of['times'], *of['rows'])),
     'directions': lambda of: 'with ' + ', '.join(

@@ -253,8 +253,7 @@ def _merge(client: Client, store: Store, own: tuple[OwnEffect, ...]) -> list[Row
     if not names:
         return read_parquet(store.folder / SENSORS)
     found = write_sensors(store, list(_in_order(client, merge_sensor, names, store, own)))
-    for _ in _in_order(client, store.finish, names):
-        pass
+    deque(_in_order(client, store.finish, names), 0)
     return found
 
 
@@ -373,14 +372,8 @@ def _each(function: Callable[..., Any], batch: Sequence[Any], *others: Any
 
 # ----------------------------------------------------------------------------- one recording
 
-class _Apart(threading.local):
-    """The process of each thread in which recordings are calibrated, so that it can be ended."""
-
-    def __init__(self) -> None:
-        self.process = WorkerProcess(idle=False)  # ends with this process
-
-
-_apart = _Apart()
+_apart = threading.local()
+"""The process of each thread in which recordings are calibrated, so that it can be ended."""
 
 
 def calibrate_recording(found: Input, options: Options, store: Store, limit_s: float
@@ -399,6 +392,8 @@ def calibrate_recording(found: Input, options: Options, store: Store, limit_s: f
             key = key_of(content, found, options)
             if store.mark(key).exists():
                 return 'skipped'
+            if not hasattr(_apart, 'process'):
+                _apart.process = WorkerProcess(idle=False)  # ends with this process
             row, calibration = _apart.process.call(
                 row_of, found, path, options, limit_s=limit_s)
         row |= {'key': key, 'content': content, 'seconds': time.perf_counter() - begin}

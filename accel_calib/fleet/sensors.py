@@ -99,8 +99,7 @@ class Store:
         folder.mkdir(parents=True, exist_ok=True)
         text = json.dumps(row)
         pa.Table.from_pylist([json.loads(text)], schema())
-        write_atomically(folder / f'{row["key"]}.json',
-                         lambda file: file.write(f'{text}\n{_digest(text)}\n'))
+        write_atomically(folder / f'{row["key"]}.json', lambda file: file.write(_sealed(text)))
 
     def waiting(self) -> list[str]:
         """Return the folders of sensors with pending rows, in order."""
@@ -228,15 +227,17 @@ def is_damaged(path: Path) -> bool:
 
 def _pending_row(path: Path) -> Row:
     """Return a row that `Store.add` wrote; ValueError if the file is damaged."""
-    text, digest, end = path.read_text(encoding='utf-8').split('\n')
-    if end or digest != _digest(text):
+    content = path.read_text(encoding='utf-8')
+    text = content.partition('\n')[0]
+    if content != _sealed(text):
         raise ValueError('the row and its digest differ')
     row: Row = json.loads(text)
     return row
 
 
-def _digest(text: str) -> str:
-    return blake2b(text.encode(), digest_size=8).hexdigest()
+def _sealed(text: str) -> str:
+    """Return a line with its digest; the page checksums of Parquet leave headers uncovered."""
+    return f'{text}\n{blake2b(text.encode(), digest_size=8).hexdigest()}\n'
 
 
 # ----------------------------------------------------------------------------- over time

@@ -9,7 +9,7 @@ them can do something else in between.
 
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import chain
@@ -168,7 +168,7 @@ class _Port:
 
     problem = ''
 
-    def lines(self, name: str, baud: int) -> Iterator[list[str]]:
+    def lines(self, name: str, baud: int) -> Generator[list[str], None, None]:
         """
         Yield complete lines, or none after a moment; the first one, maybe cut, is left out.
 

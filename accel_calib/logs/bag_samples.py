@@ -143,7 +143,9 @@ class ContextTopic:
             parts = [getattr(getattr(each, 'header', None), 'stamp', None) for each in found]
             stamps = np.array([np.nan if each is None else each.sec + each.nanosec * NANO
                                for each in parts])
-        time = stamps if self.late is None else _received(block) + self.late
+        time = stamps
+        if self.late is not None:
+            time = np.array([received for _, received, _ in block]) * NANO + self.late
         return time, values * self.factor + self.summand
 
     def track(self) -> Floats:
@@ -154,10 +156,6 @@ class ContextTopic:
         known = np.flatnonzero(np.isfinite(value))
         order = known[np.argsort(time[known], kind='stable')]
         return np.array([time[order], value[order]] if len(order) else [[0.0], [np.nan]])
-
-
-def _received(block: Sequence[Received]) -> Floats:
-    return np.array([stamp for _, stamp, _ in block]) * NANO
 
 
 def context_of(bag: Bag, imu: str, sensor: str, options: LogOptions
@@ -238,10 +236,12 @@ def _with_clock_and_unit(topic: ContextTopic, imu: str, *, named: bool
         return None, [f'there is no {topic.quantity.words}: {message}']
     notes = []
     late = 0.0  # the stamps of the first messages of the Imu after their receipt [s]
-    if of_imu := topic.bag.first(imu, size=FIRST_MESSAGES):
-        stamps = stamps_of(topic.bag.joined(of_imu, imu))
-        late = float(np.median(stamps - _received(of_imu)))
-    if not np.median(np.abs(time - _received(block) - late)) <= _SAME_CLOCK_S:
+    of_imu = topic.bag.first(imu, size=FIRST_MESSAGES)
+    received, of_block = (np.array([stamp for _, stamp, _ in each]) * NANO
+                          for each in (of_imu, block))
+    if of_imu:
+        late = float(np.median(stamps_of(topic.bag.joined(of_imu, imu)) - received))
+    if not np.median(np.abs(time - of_block - late)) <= _SAME_CLOCK_S:
         topic = replace(topic, late=late)
         notes.append(f'the messages on {what} have no stamp of the clock of the Imu: their '
                      'times are those at which the bag received them')

@@ -20,7 +20,7 @@ import numpy as np
 
 from .dialect import Cells, is_clock, is_number, Layout, shown
 from .names import (
-    BARE, bare_name, check_sensor, COMPUTED_WORDS, COUNTERS, format_named, FREE_WORDS,
+    BARE, bare_name, check_sensor, COMPUTED_WORDS, COUNTERS, folded, format_named, FREE_WORDS,
     LINEAR_WORDS, LogFormat, Meaning, meaning, OURS, RATE, READING, recognise, unit_of, UNITS,
     WHOLE_WORDS, WORDS)
 from ..errors import InputError
@@ -159,11 +159,6 @@ class Chosen:
     dates: tuple[int, ...]
     quantities: Mapping[str, int]
 
-    @property
-    def numeric(self) -> tuple[int, ...]:
-        """Return the indices of all columns of numbers."""
-        return (*self.needed, *self.context, *self.quantities.values())
-
     def numbers(self, cells: Cells, key: str) -> Floats:
         """Return the (n, k) numbers of a key as in the file; divided, if its maker says so."""
         values = np.column_stack([cells.numbers[source.index] for source in self.sources[key]])
@@ -187,7 +182,7 @@ def is_log_header(options: LogOptions, cells: Sequence[str]) -> bool:
             or recognise(cells[:MOST]) is not None)
 
 
-def chosen(layout: Layout, options: LogOptions) -> Chosen:
+def choose_columns(layout: Layout, options: LogOptions) -> Chosen:
     """
     Return the columns of a log that are used.
 
@@ -210,7 +205,9 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
             found['time'] = counted
     else:
         check_sensor(header[:MOST], layout.path)
-        theirs = maker.present(header)
+        spelled = {folded(name): name for name in reversed(header)}
+        theirs = {key: spelled[folded(name)] for key, name in maker.columns.items()
+                  if folded(name) in spelled}
         ours = {key: theirs.pop(key) for key in OURS if key in theirs}
         found = _sources(layout, {**ours, **given})
         found |= {key: column(layout, name) for key, name in theirs.items()}

@@ -378,26 +378,22 @@ def _tables(path: Path, held: _Held, load: Callable[[str], Any], advice: str) ->
                 arrays['/'.join(filter(None, (name, field)))] = column.T if is_wide else column
     # Arrays of one length together, or each alone if their names tell no accelerometer.
     tables: list[Member] = []
+    names: dict[str, list[str]] = {}  # of the columns of each array; none for a name that is empty
     by_length: dict[int, dict[str, Any]] = {}
     for name, values in arrays.items():
+        width = values.shape[1] if name else 0
+        ends = {1: [''], 3: ['_x', '_y', '_z']}.get(width, [f'_{k + 1}' for k in range(width)])
+        names[name] = [f'{name}{end}' for end in ends]
         by_length.setdefault(len(values), {})[name] = values
     for group in by_length.values():
-        header = [cell for name, values in group.items() for cell in _names(name, values)]
+        header = [cell for name in group for cell in names[name]]
         alone = len(group) == 1 and len(header) in BY_ORDER
         if is_log_header(LogOptions(), header) and not alone:
             tables.append(_table(', '.join(group), header, *group.values()))
         else:
             tables += [_table(name, [], values) for name, values in group.items()
                        if values.shape[1] in BY_ORDER]
-    return tables or [_table(name, _names(name, values), values)
-                      for name, values in arrays.items()]
-
-
-def _names(name: str, values: Any) -> list[str]:
-    """Return the names of the columns of an array; none for a name that is empty."""
-    width = values.shape[1] if name else 0
-    ends = {1: [''], 3: ['_x', '_y', '_z']}.get(width, [f'_{k + 1}' for k in range(width)])
-    return [f'{name}{end}' for end in ends]
+    return tables or [_table(name, names[name], values) for name, values in arrays.items()]
 
 
 def _table(name: str, header: list[str], *arrays: Any) -> Member:

@@ -258,14 +258,15 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
     if all(line.isspace() or line[0] == '#' for line in head):
         raise InputError(f'{path} is empty, expected a header line {_EXAMPLE}',
                          'check that this is the intended file')
-    finder = _Finder(head, is_header)
-    found = finder.named() or finder.unnamed()
+    base = _base_of(head)
+    plain = [k for k, line in enumerate(head) if base.is_row(line)]
+    found = _find_names(head, base, is_header) or _find_numbers(head, base, plain)
     if found is None:
         raise InputError(f'{path} has no table of numbers in its first '
                          f'{counted(len(head), "line")}, expected a header line {_EXAMPLE}',
                          'check that this is the intended file')
     dialect, header, at, first = found
-    cells = {k: dialect.cells(head[k]) for k in finder.plain if k > at}
+    cells = {k: dialect.cells(head[k]) for k in plain if k > at}
     below = [k for k in cells if k >= first]
     start = next((k for k in below if any(map(_LIKE_NUMBER.fullmatch, cells[k]))),
                  below[0] if below else len(head))
@@ -276,7 +277,7 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
         (begun,), (rate,) = values  # Empatica writes the time and the rate into each column
         if begun > EPOCH_S[0] and RATES_HZ[0] <= rate <= RATES_HZ[1]:
             rate_hz, start = rate, below[2] if len(below) > 2 else start
-    passed = [short(head[k]) for k in finder.plain if k < start and k != at]
+    passed = [short(head[k]) for k in plain if k < start and k != at]
     skipped = f'skipped {counted(len(passed), "line")} before the table'
     notes = [f'{skipped}{":" if len(passed) == 1 else ", the first is"} {each!r}'
              for each in passed[:1]]
@@ -300,79 +301,76 @@ _Found = tuple[Dialect, tuple[str, ...], int, int]
 """Dialect, names, and the indices of the header line (or -1) and of the first line below it."""
 
 
-class _Finder:
-    def __init__(self, head: Sequence[str], is_header: IsHeader) -> None:
-        self.head, self.is_header = head, is_header
-        self.filled = [k for k, line in enumerate(head) if not line.isspace()]
-        timed = sum(_MONITOR.match(head[k]) is not None for k in self.filled)
-        raw = sum(_MOTIONCAL.fullmatch(head[k]) is not None for k in self.filled)
-        is_gcdc = any(line.startswith(';Headers,') for line in head)
-        self.dialect = Dialect(',', timed > len(self.filled) / 2,
-                               prefix='Raw:' if raw > len(self.filled) / 3 else '',
-                               marks=(*Dialect.marks, ';') if is_gcdc else Dialect.marks)
-        self.plain = [k for k in self.filled if self.dialect.is_row(head[k])]
+def _base_of(head: Sequence[str]) -> Dialect:
+    """Return what precedes each row, and which lines are none; the delimiter is any."""
+    filled = sum(not line.isspace() for line in head)
+    timed = sum(_MONITOR.match(line) is not None for line in head)
+    raw = sum(_MOTIONCAL.fullmatch(line) is not None for line in head)
+    is_gcdc = any(line.startswith(';Headers,') for line in head)
+    return Dialect(',', timed > filled / 2, prefix='Raw:' if raw > filled / 3 else '',
+                   marks=(*Dialect.marks, ';') if is_gcdc else Dialect.marks)
 
-    def named(self) -> _Found | None:
-        """Return the names in the first line with known names."""
-        lettered = (k for k in self.filled if any(map(str.isalpha, self.head[k][:1000])))
-        for k, delimiter in ((k, each) for k in lettered for each in DELIMITERS):
-            dialect = replace(self.dialect, delimiter=delimiter)
-            cells = self._names(k, dialect)
-            if cells and self.is_header(cells):
-                row = next((dialect.cells(self.head[j]) for j in self.plain if j > k), [])
-                if len(row) == len(cells) or (
-                        delimiter and not self.head[k].startswith(Dialect.marks)):
-                    return dialect, tuple(cells), k, k + 1
-        return None
 
-    def _names(self, k: int, dialect: Dialect) -> list[str]:
-        """
-        Return the cells of a header line; none if they are few or there are numbers.
+def _find_names(head: Sequence[str], base: Dialect, is_header: IsHeader) -> _Found | None:
+    """Return the names in the first line with known names."""
+    lettered = (k for k, line in enumerate(head) if any(map(str.isalpha, line[:1000])))
+    for k, delimiter in product(lettered, DELIMITERS):
+        dialect = replace(base, delimiter=delimiter)
+        cells = _names_in(head[k], dialect)
+        if cells and is_header(cells):
+            row = next((dialect.cells(line) for line in head[k + 1:] if base.is_row(line)), [])
+            if len(row) == len(cells) or (delimiter and not head[k].startswith(Dialect.marks)):
+                return dialect, tuple(cells), k, k + 1
+    return None
 
-        A time of a monitor in front of them is the name of the times.
 
-        """
-        line = self.head[k].removeprefix(';Headers,')
-        cells = dialect.cells(line.lstrip('#/% ') if line.startswith(Dialect.marks) else line)
-        if dialect.monitor and cells and is_clock(cells[0]):
-            cells[0] = 'time'
-        return [] if len(cells) < 3 or any(map(_LIKE_NUMBER.fullmatch, cells)) else cells
+def _names_in(line: str, dialect: Dialect) -> list[str]:
+    """
+    Return the cells of a header line; none if they are few or there are numbers.
 
-    def unnamed(self) -> _Found | None:
-        """
-        Return the dialect in which most lines are rows of numbers, and their names, if any.
+    A time of a monitor in front of them is the name of the times.
 
-        If the table has too few columns, the first line has the names.
+    """
+    line = line.removeprefix(';Headers,')
+    cells = dialect.cells(line.lstrip('#/% ') if line.startswith(Dialect.marks) else line)
+    if dialect.monitor and cells and is_clock(cells[0]):
+        cells[0] = 'time'
+    return [] if len(cells) < 3 or any(map(_LIKE_NUMBER.fullmatch, cells)) else cells
 
-        """
-        step = max(1, len(self.plain) // _TRIED_LINES)
-        lines = [self.head[k] for k in self.plain[::-step]]
-        tried = []
-        for labelled, delimiter in product((False, True), DELIMITERS):
-            dialect = replace(self.dialect, delimiter=delimiter, labelled=labelled)
-            widths = Counter(filter(any, (_row_width(dialect.cells(line)) for line in lines)))
-            for (width, others), count in widths.most_common(1):
-                tried.append((count, -others, width, dialect))
-        if not tried:
-            dialect = Dialect(',')
-            cells = [dialect.cells(self.head[k]) for k in self.plain]
-            numbers = [any(map(_LIKE_NUMBER.fullmatch, row)) for row in cells]
-            if not any(numbers):
-                return None
-            first, names = self.plain[0], () if numbers[0] else tuple(cells[0])
-            return dialect, names, first, first + len(names[:1])
-        _, _, width, dialect = max(tried, key=lambda each: each[:2])
-        first = next((k for k in self.plain
-                      if _row_width(dialect.cells(self.head[k]))[0] == width), self.plain[-1])
-        if dialect.prefix:
-            return dialect, _MOTIONCAL_NAMES, -1, first
-        if dialect.labelled:
-            line = _LABELLED_UNIT.sub('', _MONITOR.sub('', self.head[first]))
-            names = tuple(name.strip(' :=\t') for name in _LABEL.findall(line))
-            return dialect, (*('time',) * dialect.monitor, *names), -1, first
-        before = ((k, self._names(k, dialect)) for k in reversed(self.filled) if k < first)
-        return next(((dialect, tuple(cells), k, first) for k, cells in before
-                     if len(cells) == width), (dialect, (), -1, first))
+
+def _find_numbers(head: Sequence[str], base: Dialect, plain: Sequence[int]) -> _Found | None:
+    """
+    Return the dialect in which most `plain` lines are rows of numbers, and their names, if any.
+
+    If the table has too few columns, the first line has the names.
+
+    """
+    step = max(1, len(plain) // _TRIED_LINES)
+    tried = []
+    for labelled, delimiter in product((False, True), DELIMITERS):
+        dialect = replace(base, delimiter=delimiter, labelled=labelled)
+        widths = Counter(filter(any, (_row_width(dialect.cells(head[k])) for k in plain[::-step])))
+        for (width, others), count in widths.most_common(1):
+            tried.append((count, -others, width, dialect))
+    if not tried:
+        dialect = Dialect(',')
+        cells = [dialect.cells(head[k]) for k in plain]
+        numbers = [any(map(_LIKE_NUMBER.fullmatch, row)) for row in cells]
+        if not any(numbers):
+            return None
+        names = () if numbers[0] else tuple(cells[0])
+        return dialect, names, plain[0], plain[0] + len(names[:1])
+    _, _, width, dialect = max(tried, key=lambda each: each[:2])
+    first = next((k for k in plain if _row_width(dialect.cells(head[k]))[0] == width), plain[-1])
+    if dialect.prefix:
+        return dialect, _MOTIONCAL_NAMES, -1, first
+    if dialect.labelled:
+        line = _LABELLED_UNIT.sub('', _MONITOR.sub('', head[first]))
+        names = tuple(name.strip(' :=\t') for name in _LABEL.findall(line))
+        return dialect, (*('time',) * dialect.monitor, *names), -1, first
+    before = ((k, _names_in(head[k], dialect)) for k in reversed(range(first)))
+    return next(((dialect, tuple(cells), k, first) for k, cells in before
+                 if len(cells) == width), (dialect, (), -1, first))
 
 
 def _row_width(cells: Sequence[str]) -> tuple[int, int]:

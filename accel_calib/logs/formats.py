@@ -35,7 +35,7 @@ from .containers import Frame, Member, Piped, Stream
 from .dialect import shown
 from .flight import DATAFLASH, read_dataflash, read_ulg
 from .names import meaning, record_instead
-from .quantities import are_samples, decided
+from .quantities import are_samples, decide_quantities
 from .text import PEEKED, text_table, TextTable
 from ..disk import check_regular, FIRST_LINE
 from ..errors import DamagedLogError, InputError, needing, saying
@@ -240,7 +240,7 @@ def _member_of(file: LogFile, members: Sequence[Member], options: LogOptions
 def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     cells = text.blocks()
     first = next(cells)
-    quantities = decided(text.columns, first, options)
+    quantities = decide_quantities(text.columns, first, options)
     if quantities.clock.newest_first:
         first, *rest = (each.take(slice(None, None, -1)) for each in [first, *cells][::-1])
         cells = iter(rest)

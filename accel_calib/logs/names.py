@@ -289,12 +289,6 @@ class LogFormat:
         given = {folded(name) for name in header}
         return [name for name in self.needed if folded(name) not in given]
 
-    def present(self, header: Sequence[str]) -> dict[str, str]:
-        """Return the columns of this layout in a header, with the spelling of the header."""
-        spelled = {folded(name): name for name in reversed(header)}
-        return {key: spelled[folded(name)] for key, name in self.columns.items()
-                if folded(name) in spelled}
-
 
 def folded(name: str) -> str:
     """Return a name without quotes, in lower case, with single spaces."""
@@ -361,15 +355,14 @@ _FRD = ('Axes are x forward, y right, z down, so that a level vehicle reads -1 g
         'turns them to x forward, y left, z up.')
 
 
-def _numbered(name: str) -> tuple[str, ...]:
-    return tuple(f'{name}[{k}]' for k in range(3))
-
-
 PX4_FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
-    'sensor_accel': {'reading': _LOWER},
-    'sensor_combined': {'reading': _numbered('accelerometer_m_s2'), 'rate': _numbered('gyro_rad')},
-    'vehicle_imu': {'reading': _numbered('delta_velocity'), 'rate': _numbered('delta_angle')},
-    'vehicle_acceleration': {'reading': _numbered('xyz')}}
+    message: {key: (*_axes(pattern, names=names).values(),) for key, pattern in patterns.items()}
+    for message, names, patterns in (
+        ('sensor_accel', _LOWER, {'reading': '{}'}),
+        ('sensor_combined', _BY_NUMBER, {'reading': 'accelerometer_m_s2[{}]',
+                                         'rate': 'gyro_rad[{}]'}),
+        ('vehicle_imu', _BY_NUMBER, {'reading': 'delta_velocity[{}]', 'rate': 'delta_angle[{}]'}),
+        ('vehicle_acceleration', _BY_NUMBER, {'reading': 'xyz[{}]'}))}
 """Fields of the messages with accelerations, in order of preference, by key of `COLUMNS`."""
 
 PX4_SPANS = {'reading': 'delta_velocity_dt', 'rate': 'delta_angle_dt'}

@@ -4,7 +4,7 @@
 """
 Quantities of a text log: the conversion of its columns to our units.
 
-`decided` looks at the first block of numbers and decides the unit of each column: what the user,
+`decide_quantities` decides the unit of each column from the first block of numbers: what the user,
 a comment of the file, the maker's layout or the name states, in this order, or else what the
 readings at rest and the rate of the samples show. Each assumption is in `Quantities.said`.
 
@@ -112,7 +112,7 @@ _LIKELY_TEMPERATURE_C = (-60.0, 150.0)
 @dataclass
 class Quantities:
     """
-    The conversion of the columns of a log; `decided` makes it.
+    The conversion of the columns of a log; `decide_quantities` makes it.
 
     `clock` converts the times; `rate_hz` is the rate of samples without times. By key of
     `COLUMNS`, `scales` are the factor to our unit and our value at 0, and `modulus` is 2ⁿ where
@@ -144,7 +144,8 @@ class Quantities:
     def columns(self, cells: Cells, source: str, *, partial: bool = False
                 ) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:
         """Return the columns of a block in our units, and its row numbers; see `check_values`."""
-        cells = self.of_sensor(cells)
+        if self.instance is not None:
+            cells = cells.take(self.chosen.numbers(cells, 'instance')[:, 0] == self.instance)
         columns: dict[str, NDArray[Any]] = {}
         for key, own in self.chosen.sources.items():
             if key == 'label':
@@ -163,12 +164,6 @@ class Quantities:
         check_values(columns, source, partial=partial)
         return columns, cells.row
 
-    def of_sensor(self, cells: Cells) -> Cells:
-        """Return the rows of the sensor that is read."""
-        if self.instance is None:
-            return cells
-        return cells.take(self.chosen.numbers(cells, 'instance')[:, 0] == self.instance)
-
     def numbers(self, cells: Cells, key: str) -> Floats:
         """Return the numbers of a key, (n, k), with their sign, in the unit of the file."""
         values = self.chosen.numbers(cells, key)
@@ -178,7 +173,7 @@ class Quantities:
 
 
 @np.errstate(over='ignore', invalid='ignore')  # numbers beyond any sensor are refused later
-def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
+def decide_quantities(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
     """Return the conversion of the columns, from the first block of a log; see above."""
     made = Quantities(columns, units_of('m/s2', options.gravity), Clock(columns))
     if columns.maker is not None:
@@ -186,8 +181,16 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
         made.notes += [columns.maker.note] if columns.maker.note else []
     made.said += columns.layout.words
     if 'instance' in columns.sources:
-        made.instance = _instance(columns, first, options, made.notes)
-        first = made.of_sensor(first)
+        there = np.unique(columns.numbers(first, 'instance')).tolist()
+        names = [f'{each:g}' for each in there]
+        if options.sensor and options.instance not in names:
+            raise InputError(f'{columns.layout.path} has the sensors {", ".join(names)}, expected '
+                             f'{options.sensor}', 'choose one of them with --sensor')
+        made.instance = float(options.instance) if options.sensor else there[0]
+        if len(there) > 1 and not options.sensor:
+            made.notes.append(f'the log has the sensors {", ".join(names)}; sensor {names[0]} is '
+                              'read: choose another with --sensor')
+        first = first.take(columns.numbers(first, 'instance')[:, 0] == made.instance)
     for key in ('reading', 'rate'):
         if key in columns.sources and (modulus := modulus_of(columns.numbers(first, key))):
             made.modulus[key] = modulus
@@ -195,24 +198,19 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
                 'signs', f'{compact(columns.names(key))} are numbers of '
                 f'{round(math.log2(modulus))} bits that lost their sign: they are read with it',
                 'print them as signed numbers'))
-    if not (columns.layout.header or options.columns) and _are_exchanged(made, first):
-        swapped = {'reading': 'rate', 'rate': 'reading'}
-        columns = made.chosen = replace(columns, sources={
-            key: columns.sources[swapped.get(key, key)] for key in columns.sources})
-        made.modulus = {swapped[key]: each for key, each in made.modulus.items()}
-        words = f'{compact(columns.names("rate"))} are a gyro by their values'
-        made.said.append(words)
-        made.findings.append(Finding('columns', words, 'name the columns in the first line'))
-    there = dict.fromkeys(columns.sources, made.numbers(first, 'reading'))
-    if 'time' in there:
+    if not (columns.layout.header or options.columns):
+        _find_gyro(made, first)
+    columns = made.chosen
+    rows = dict.fromkeys(columns.sources, made.numbers(first, 'reading'))
+    if 'time' in rows:
         made.clock = clock_of(columns, first, options)
         made.notes += made.clock.doubts
-        samples = are_samples({**there, 'time': made.clock.seconds(first)})
+        samples = are_samples({**rows, 'time': made.clock.seconds(first)})
     else:
-        samples = bool(options.rate) or are_samples(there)
+        samples = bool(options.rate) or are_samples(rows)
         made.rate_hz = options.rate or (columns.layout.rate_hz if samples else None)
     made.clock.newest_first &= samples  # rows of poses keep their numbers
-    if 'time' in there and (samples or columns.names('time') != ['time']):
+    if 'time' in rows and (samples or columns.names('time') != ['time']):
         made.said += [made.clock.words, *(each.text for each in made.clock.findings)]
     _decide_reading(made, first, options, samples=samples)
     _decide_rate(made, first)
@@ -221,18 +219,25 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
     return made
 
 
-def _are_exchanged(made: Quantities, first: Cells) -> bool:
-    """Return whether the rates of columns without names have a steady length, as gravity has."""
+def _find_gyro(made: Quantities, first: Cells) -> None:
+    """Exchange readings and rates without names if the rates have the steady length of gravity."""
     if ('rate' not in made.chosen.sources
             or rests_of(made.numbers(first, 'reading'), samples=True).unit is not None):
-        return False
+        return
     steady = {}  # median length of the vectors, relative to its scatter
     for key in ('reading', 'rate'):
         length = np.linalg.norm(made.numbers(first, key), axis=1)
         middle = float(np.median(length))
         scatter = float(np.median(np.abs(length - middle)))
         steady[key] = middle / scatter if scatter > 0.0 else math.inf if middle > 0.0 else 0.0
-    return steady['rate'] > max(_STEADY, _STEADIER * steady['reading'])
+    if steady['rate'] > max(_STEADY, _STEADIER * steady['reading']):
+        swapped = {'reading': 'rate', 'rate': 'reading'}
+        made.chosen = replace(made.chosen, sources={
+            key: made.chosen.sources[swapped.get(key, key)] for key in made.chosen.sources})
+        made.modulus = {swapped[key]: each for key, each in made.modulus.items()}
+        words = f'{compact(made.chosen.names("rate"))} are a gyro by their values'
+        made.said.append(words)
+        made.findings.append(Finding('columns', words, 'name the columns in the first line'))
 
 
 def modulus_of(values: Floats) -> float:
@@ -254,20 +259,6 @@ def modulus_of(values: Floats) -> float:
     steps = np.abs(np.diff(signed, axis=0)).sum()
     empty = largest > _NEAR_TOP * modulus and np.mean(apart < _MIDDLE) < _IN_MIDDLE
     return modulus if empty and steps < _SMOOTHER * jumps else 0.0
-
-
-def _instance(columns: Chosen, first: Cells, options: LogOptions, notes: list[str]) -> float:
-    there = np.unique(columns.numbers(first, 'instance')).tolist()
-    names = [f'{each:g}' for each in there]
-    if options.sensor:
-        if options.instance not in names:
-            raise InputError(f'{columns.layout.path} has the sensors {", ".join(names)}, expected '
-                             f'{options.sensor}', 'choose one of them with --sensor')
-        return float(options.instance)
-    if len(there) > 1:
-        notes.append(f'the log has the sensors {", ".join(names)}; sensor {names[0]} is read: '
-                     'choose another with --sensor')
-    return float(there[0])
 
 
 # ---------------------------------------------------------------------------------- reading

@@ -82,22 +82,19 @@ class Layout:
 def layout_with(frame_id: str) -> Layout:
     """Return the layout of messages with this frame_id."""
     letters = frame_id.encode() + b'\x00'
-    return _layout_named(len(letters).to_bytes(4, 'little') + letters)
+    begin = begin_of(len(letters), ros2=True)
+    return Layout(len(letters).to_bytes(4, 'little') + letters, begin, begin + 8 * IMU_DOUBLES)
 
 
 def layout_of(data: bytes) -> Layout | None:
     """Return the layout of a message, or None if it is not a whole Imu in little-endian CDR."""
     length = int.from_bytes(data[NAME_AT:LETTERS_AT], 'little')
     name = data[NAME_AT:LETTERS_AT + length]
-    layout = _layout_named(name)
+    begin = begin_of(len(name) - 4, ros2=True)
+    layout = Layout(name, begin, begin + 8 * IMU_DOUBLES)
     whole = (data[:4] == LITTLE_ENDIAN and length > 0 and len(name) == 4 + length
              and len(data) == layout.size)
     return layout if whole and name[-1] == 0 else None
-
-
-def _layout_named(name: bytes) -> Layout:
-    begin = begin_of(len(name) - 4, ros2=True)
-    return Layout(name, begin, begin + 8 * IMU_DOUBLES)
 
 
 Bytes = NDArray[np.uint8]

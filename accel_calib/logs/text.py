@@ -30,9 +30,9 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import chosen, is_log_header, LogOptions
+from .columns import choose_columns, is_log_header, LogOptions
 from .dialect import Cells, Dialect, is_clock, is_number, layout_of, short
-from .quantities import decided
+from .quantities import decide_quantities
 from ..disk import write_atomically
 from ..errors import InputError
 from ..table import column_of, COLUMNS, Floats, Recording, Table
@@ -122,7 +122,9 @@ class TextTable:
     def __init__(self, path: Path, head: Sequence[str], rest: Iterator[str], options: LogOptions,
                  encoding: str = 'utf-8', size: int = 0) -> None:
         self.layout = layout_of(path, head, partial(is_log_header, options), encoding)
-        self.columns, self.size = chosen(self.layout, options), size
+        self.columns, self.size = choose_columns(self.layout, options), size
+        self._numeric = (*self.columns.needed, *self.columns.context,
+                         *self.columns.quantities.values())
         self._lines, self._skip_bad = chain(head[self.layout.start:], rest), options.skip_bad
         self._line, self._row = self.layout.start, 0
         self._bad = self._cut = ''
@@ -153,12 +155,12 @@ class TextTable:
 
     def read(self, lines: Sequence[str], *, last: bool = False) -> Cells:
         """Return the rows of the next lines; a row that is cut at the last line is left out."""
-        dialect, numeric = self.layout.dialect, self.columns.numeric
+        dialect, numeric = self.layout.dialect, self._numeric
         kept = list(filter(dialect.is_row, lines))
         rows, k = ([], 0) if '"' in ''.join(kept) else (kept, len(kept))
         while k < len(kept):  # a quoted cell can have several lines, at most 20
-            last = min(k + 20, len(kept)) if kept[k].count('"') % 2 else k
-            end = next((j for j in range(k + 1, last) if kept[j].count('"') % 2), k)
+            most = min(k + 20, len(kept)) if kept[k].count('"') % 2 else k
+            end = next((j for j in range(k + 1, most) if kept[j].count('"') % 2), k)
             rows.append(''.join(kept[k:end + 1]))
             k = end + 1
         is_joined = len(rows) < len(kept)
@@ -188,7 +190,7 @@ class TextTable:
 
     def _parsed(self, lines: list[str]) -> Floats | None:
         """Return the numbers of rows, or None if one may have a fault."""
-        layout, columns = self.layout, self.columns.numeric
+        layout, columns = self.layout, self._numeric
         dialect, delimiter = layout.dialect, layout.dialect.delimiter
         texts, breaks = lines, layout.width - 1
         if dialect.monitor or dialect.labelled or dialect.prefix or '"' in ''.join(lines):
@@ -273,18 +275,17 @@ class LineReader:
                              'check the format of the lines')
         timed = 'time' in self._table.columns.sources
         rate_hz = options.rate or len(first.row) / len(rows) / interval
-        self._quantities = decided(self._table.columns, first, options if timed else
-                                   replace(options, rate=rate_hz))
+        self._quantities = decide_quantities(
+            self._table.columns, first, options if timed else replace(options, rate=rate_hz))
         self.units = self._quantities.units
         rate = f'no times, {rate_hz:.4g} Hz ({"stated" if options.rate else "measured"})'
         self.read_as = ', '.join([*self._quantities.said, *(() if timed else (rate,))])
-        self.first, self.findings = self._recording(first), tuple(self._quantities.findings)
+        self.first = Recording(*self._quantities.columns(first, name), self.units.name)
+        self.findings = tuple(self._quantities.findings)
 
     def samples(self, lines: Sequence[str]) -> Recording | None:
         """Return the samples of the next complete lines; None if there are none."""
-        return self._recording(self._table.read([f'{line}\n' for line in lines]))
-
-    def _recording(self, cells: Cells) -> Recording | None:
+        cells = self._table.read([f'{line}\n' for line in lines])
         if not len(cells.row):
             return None
         columns, row = self._quantities.columns(cells, self._name)

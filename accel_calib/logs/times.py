@@ -165,7 +165,8 @@ def _stated_clock(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
     if columns.dates:
         match = CLOCK.fullmatch(first.texts[source.index][0])
         dated = match is not None and match[1] is not None
-        rate = _rate_words(_step_of(Clock(columns).seconds(first)))
+        step = _step_of(Clock(columns).seconds(first))
+        rate = f' ({1.0 / step:.3g} Hz)' if step > 0.0 else ''
         return Clock(columns, periods=() if dated else (_DAY_S,), words=(
             f'{source.name}: {"dates" if dated else "times of the day"}{rate} -> s'))
     stamps = columns.numbers(first, 'time')[:, 0]
@@ -180,16 +181,13 @@ def _stated_clock(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
     scale = {**_UNITS, _TICK: 1e-4}[unit]
     step = scale * _step_of(stamps)
     named = f'column {source.name}' if source.name.isdecimal() else source.name
-    words = f'{named} in {unit}{_rate_words(step)}{"" if unit == "s" else " -> s"}'
+    rate = f' ({1.0 / step:.3g} Hz)' if step > 0.0 else ''
+    words = f'{named} in {unit}{rate}{"" if unit == "s" else " -> s"}'
     agrees = not layout.rate_hz or not step > 0.0 or any(
-        _agree(1.0 / step, rate) for rate in rates_beside(layout, source))
+        1.0 / _AGREES < 1.0 / step / each < _AGREES for each in rates_beside(layout, source))
     doubts = () if agrees else (f'{source.name} has {1.0 / step:.4g} samples per second, but the '
                                 f'file states {layout.rate_hz:g} Hz',)
     return Clock(columns, scale, _PERIODS_S.get(unit, ()), words, doubts)
-
-
-def _rate_words(step: float) -> str:
-    return f' ({1.0 / step:.3g} Hz)' if step > 0.0 else ''
 
 
 def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
@@ -202,11 +200,20 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
         return stated[0]
     step, of_poses = _step_of(stamps), 'count' in columns.sources
     if layout.header and source.name == 'time' and step < (
-            _POSES_FAR_S if of_poses else _FAR_S) and (
-            layout.about or of_poses or (
-                columns.names('reading') == [*READING]
-                and not _is_dense(stamps, columns.numbers(first, 'reading')))):
-        return 's'
+            _POSES_FAR_S if of_poses else _FAR_S):
+        is_marked = bool(layout.about) or of_poses
+        is_ours = is_marked or columns.names('reading') == [*READING]
+        # A sensor that is logged each ten seconds is nearly always still. In a recording of turns
+        # and rests the scatter within many short windows is much larger than that at rest. Of real
+        # recordings by hand that is 10 % of the windows or more, of 58 h at rest 1 %.
+        if is_ours and not is_marked and len(stamps) >= _MANY_ROWS and step >= 1.0:
+            reading = columns.numbers(first, 'reading')
+            windows = reading[:len(reading) // _WINDOW * _WINDOW].reshape(-1, _WINDOW, 3)
+            scatter = np.linalg.norm(windows.std(axis=1), axis=1)
+            at_rest = float(np.quantile(scatter, _AT_REST))
+            is_ours = not np.mean(scatter > _MOVES * at_rest) > _MOVING
+        if is_ours:
+            return 's'
     # A unit with a plausible rate, best one that the file states; else s.
     units = TICKS.get(bare_name(source.name), _UNITS)
     beside = rates_beside(layout, source)
@@ -215,7 +222,8 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
     rates = {name: 1.0 / (step * unit) for name, unit in units.items()}
     plausible = [name for name, rate in rates.items() if RATES_HZ[0] * 0.9 <= rate
                  <= RATES_HZ[1] * 1.1]
-    agreeing = [name for name in rates if any(_agree(rates[name], rate) for rate in beside)]
+    agreeing = [name for name, rate in rates.items()
+                if any(1.0 / _AGREES < rate / each < _AGREES for each in beside)]
     since_1970 = [name for name in plausible
                   if EPOCH_S[0] <= float(np.median(stamps)) * units[name] <= EPOCH_S[1]]
     if not np.all(stamps == np.round(stamps)) and 's' in plausible:
@@ -233,10 +241,6 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
                key=lambda name: abs(math.log(rates[name] / usual)))
 
 
-def _agree(one: float, two: float) -> bool:
-    return 1.0 / _AGREES < one / two < _AGREES
-
-
 def _step_of(stamps: Floats) -> float:
     """Return the usual step between stamps; some sensors repeat a stamp of whole ms."""
     steps = np.diff(stamps)
@@ -249,20 +253,3 @@ def _step_of(stamps: Floats) -> float:
         usual = steps[(steps >= 0.0) & (steps <= _GAP * middle)]
         return float(np.mean(usual)) if len(usual) else middle
     return float(np.maximum(steps, 0.0).sum()) / len(steps)
-
-
-def _is_dense(stamps: Floats, reading: Floats) -> bool:
-    """
-    Return whether rows that are far apart in seconds are the samples of a moving sensor.
-
-    A sensor that is logged each ten seconds is nearly always still. In a recording of turns and
-    rests the scatter within many short windows is much larger than that at rest. Of real
-    recordings by hand that is 10 % of the windows or more, of 58 h at rest 1 %.
-
-    """
-    if len(stamps) < _MANY_ROWS or _step_of(stamps) < 1.0:
-        return False
-    windows = reading[:len(reading) // _WINDOW * _WINDOW].reshape(-1, _WINDOW, 3)
-    scatter = np.linalg.norm(windows.std(axis=1), axis=1)
-    at_rest = float(np.quantile(scatter, _AT_REST))
-    return bool(np.mean(scatter > _MOVES * at_rest) > _MOVING)

@@ -114,56 +114,58 @@ class Fitted:
 
 @dataclass(frozen=True)
 class _Solution:
-    """Squared sizes, their covariance (0 where the size is 0), and χ²."""
+    """Squared sizes, their covariance (0 where the size is 0), χ², and the probability of it."""
 
     squares: Floats
     covariance: Floats
     chi_square: float
+    p_value: float
 
 
 def fit_components(variances: Floats, lengths: Counts, spread: Spread) -> Fitted:
     """Fit the components to (k,) overlapping Allan variances > 0 at these (k,) lengths."""
     shape = shares(lengths)
-    first, last = _range(variances, shape, spread)
-    curve = _RangeFit(variances, shape, spread, slice(first, last + 1))
+    first, last = _find_range(variances, shape, spread)
+    which = slice(first, last + 1)
+    curve = _RangeFit(variances[which], shape[which], spread, which)
     free = [c for c in _EVERY if COMPONENTS[c] in FIGURES or curve.rise(_EVERY, c) > _RISE[c]]
     rises = np.array([curve.rise(free, c) if c in free else 0.0 for c in _EVERY])
     found = curve.solve(free)
-    parts = shape[first:last + 1] * found.squares
+    parts = curve.shape * found.squares
     large = np.max(parts / parts.sum(axis=1, keepdims=True), axis=0) >= _LEAST_SHARE
     seen = (found.squares > 0.0) & large & (rises > _RISE)
     if last - first + 1 < _LONG_RANGE:
         seen[2:] = False
     return Fitted(curve.noisy(found.squares),
                   tuple(curve.component(found, c, bool(seen[c])) for c in _EVERY),
-                  first, last, curve.p_value(found))
+                  first, last, found.p_value)
 
 
+@dataclass(frozen=True)
 class _RangeFit:
     """The variances of one axis in a range of τ, to which components are fitted."""
 
-    def __init__(self, variances: Floats, shape: Floats, spread: Spread, which: slice) -> None:
-        self._spread = spread
-        self._which = which
-        self._variances = variances[which]
-        self._shape = shape[which]
+    variances: Floats
+    shape: Floats
+    spread: Spread
+    which: slice
 
     def _whitened(self, squares: Floats) -> tuple[Floats, Floats]:
         """Return shape and variances, transformed so that the errors are independent."""
-        covariance = self._spread.covariance(self.noisy(squares))[self._which, self._which]
+        covariance = self.spread.covariance(self.noisy(squares))[self.which, self.which]
         # The matrix is small: its inverse is faster than solve_triangular, which starts threads.
         whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-        return whitening @ self._shape, whitening @ self._variances
+        return whitening @ self.shape, whitening @ self.variances
 
     def noisy(self, squares: Floats) -> Floats:
         """Return the squares with some white noise: without noise there is no covariance."""
-        least = 1e-6 * float(np.min(self._variances / self._shape[:, 1]))
+        least = 1e-6 * float(np.min(self.variances / self.shape[:, 1]))
         return np.where(np.arange(len(squares)) == 1, np.maximum(squares, least), squares)
 
     def solve(self, free: list[int]) -> _Solution:
         """Return the fit of the free components."""
         squares: Floats = np.zeros(len(COMPONENTS))
-        given = self._shape[:, free] / self._variances[:, np.newaxis]
+        given = self.shape[:, free] / self.variances[:, np.newaxis]
         squares[free] = scipy.optimize.nnls(given, np.ones(len(given)))[0]
         for _ in range(_ROUNDS):
             before, squares = squares, np.zeros(len(COMPONENTS))
@@ -173,7 +175,9 @@ class _RangeFit:
                 break
         shape, variances = self._whitened(squares)
         left = variances - shape @ squares
-        return _Solution(squares, _covariance(free, shape), float(left @ left))
+        freedom = len(left) - int(np.sum(squares > 0.0))
+        return _Solution(squares, _covariance(free, shape), float(left @ left),
+                         float(scipy.special.chdtrc(max(freedom, 1), left @ left)))
 
     def rise(self, kept: list[int], without: int) -> float:
         """Return the rise of χ² without a component, with the covariance of the fit without."""
@@ -181,35 +185,24 @@ class _RangeFit:
         shape, variances = self._whitened(rest.squares)
         return rest.chi_square - float(scipy.optimize.nnls(shape[:, kept], variances)[1])**2
 
-    def p_value(self, found: _Solution) -> float:
-        """Return the probability of χ²."""
-        freedom = len(self._variances) - int(np.sum(found.squares > 0.0))
-        return float(scipy.stats.chi2.sf(found.chi_square, max(freedom, 1)))
-
     def component(self, found: _Solution, which: int, seen: bool) -> Component:
         """Return one component, or its upper limit."""
-        if not seen:
-            return Component(np.nan, np.nan, (np.nan, np.nan), self._upper(found, which))
+        if not seen:  # the size whose estimate is this small with a probability of 5 %
+            free = sorted({which, *np.flatnonzero(found.squares)})
+            estimate = self.solve(free)
+            trial = estimate.squares.copy()
+            trial[which] = max(trial[which], 1e-3 * float(np.min(
+                self.variances / self.shape[:, which])))
+            for _ in range(_ROUNDS):
+                variance = _covariance(free, self._whitened(trial)[0])[which, which]
+                trial[which] = estimate.squares[which] + 1.645 * np.sqrt(variance)
+            return Component(np.nan, np.nan, (np.nan, np.nan), float(np.sqrt(trial[which])))
         square, variance = found.squares[which], found.covariance[which, which]
         value, freedom = float(np.sqrt(square)), 2.0 * square**2 / variance
         ends = np.sqrt(square * freedom / scipy.stats.chi2.ppf(
             [0.5 + 0.5 * LEVEL, 0.5 - 0.5 * LEVEL], freedom))
         return Component(value, float(np.sqrt(variance)) / (2.0 * value),
                          (float(ends[0]), float(ends[1])), float(ends[1]))
-
-    def _upper(self, found: _Solution, which: int) -> float:
-        """Return the size whose estimate is this small with a probability of 5 %."""
-        free = sorted({which, *np.flatnonzero(found.squares)})
-        estimate = self.solve(free)
-        trial = estimate.squares.copy()
-        trial[which] = max(trial[which], 1e-3 * float(np.min(
-            self._variances / self._shape[:, which])))
-        for _ in range(_ROUNDS):
-            variance = _covariance(free, self._whitened(trial)[0])[which, which]
-            freedom = 2.0 * trial[which]**2 / variance
-            normal = 1.645 * np.sqrt(variance)
-            trial[which] = estimate.squares[which] + normal if freedom > 0.0 else normal
-        return float(np.sqrt(trial[which]))
 
 
 def _covariance(free: list[int], shape: Floats) -> Floats:
@@ -219,32 +212,28 @@ def _covariance(free: list[int], shape: Floats) -> Floats:
     return covariance
 
 
-def _range(variances: Floats, shape: Floats, spread: Spread) -> tuple[int, int]:
+def _find_range(variances: Floats, shape: Floats, spread: Spread) -> tuple[int, int]:
     """Return the first and last octave of the range over which the components are plausible."""
-    first, last = 0, len(variances) - 1
-    solved = _tried(variances, shape, spread, first, last)
-    visited = [(solved[0], (first, last))]
-    while solved[1] < LEAST_P and last - first >= _LEAST_RANGE:
-        shorter = [(first + 1, last), (first, last - 1)]
-        tried = [_tried(variances, shape, spread, *ends) for ends in shorter]
-        solved, (first, last) = min(zip(tried, shorter, strict=True))
+    tried, visited = [(0, len(variances) - 1)], []
+    while True:
+        solved = []
+        for first, last in tried:
+            which = slice(first, last + 1)
+            found = _RangeFit(variances[which], shape[which], spread, which).solve(_EVERY)
+            solved.append((found.chi_square, found.p_value, first, last))
+        chi_square, chance, first, last = min(solved)
         dropped = len(variances) - 1 - (last - first)
-        visited.append((solved[0] + _PER_OCTAVE * dropped, (first, last)))
-    first, last = min(visited)[1]
+        visited.append((chi_square + _PER_OCTAVE * dropped, first, last))
+        if chance >= LEAST_P or last - first < _LEAST_RANGE:
+            break
+        tried = [(first + 1, last), (first, last - 1)]
+    _, first, last = min(visited)
     # A filter or a drift fades over some octaves beyond those where it is plain.
     if last < len(variances) - 1:
         last = max(last - _MARGIN[1], first + _LEAST_RANGE - 1)
     if first > 0:
         first = min(first + _MARGIN[0], last - _LEAST_RANGE + 1)
     return first, last
-
-
-def _tried(variances: Floats, shape: Floats, spread: Spread, first: int, last: int
-           ) -> tuple[float, float]:
-    """Return χ² and its probability over a range of octaves."""
-    curve = _RangeFit(variances, shape, spread, slice(first, last + 1))
-    found = curve.solve(_EVERY)
-    return found.chi_square, curve.p_value(found)
 
 
 Kind = Literal['accelerometer', 'gyroscope']

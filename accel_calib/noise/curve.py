@@ -179,7 +179,14 @@ class Spread:
 def spread_of(lengths: Counts, samples: int) -> Spread:
     """Return the covariances for these lengths and this number of samples."""
     first, second = np.triu_indices(len(lengths))
-    lags = [_lags(lengths[i], lengths[j], samples) for i, j in zip(first, second, strict=True)]
+    lags = []  # between the centres of two differences, dense near each kink of γ
+    for one, two in zip(lengths[first], lengths[second], strict=True):
+        last = samples + 1 - one - two
+        growth = np.arange(1.0, np.log(max(last, 2)) / np.log(_GROWTH) + 1.0)
+        distance = np.concatenate([np.arange(9), np.round(_GROWTH**growth).astype(np.int64)])
+        kinks = np.array([0, one, two, two - one, two + one])
+        around = kinks[:, np.newaxis] + np.concatenate([-distance, distance])
+        lags.append(np.unique(np.append(around[(around >= 0) & (around <= last)], [0, last])))
     most = max(map(len, lags))
     gamma, weight = np.zeros((len(lags), 4, most)), np.zeros((len(lags), most))
     for p, (i, j, lag) in enumerate(zip(first, second, lags, strict=True)):
@@ -194,16 +201,6 @@ def spread_of(lengths: Counts, samples: int) -> Spread:
         lengths[first] * lengths[second])
     of_mean[:, second, first] = of_mean[:, first, second]
     return Spread(np.column_stack([first, second]), gamma, weight, of_mean)
-
-
-def _lags(one: int, two: int, samples: int) -> Counts:
-    """Return lags between the centres of the differences, dense near each kink of γ."""
-    last = samples + 1 - one - two
-    growth = np.arange(1.0, np.log(max(last, 2)) / np.log(_GROWTH) + 1.0)
-    distance = np.concatenate([np.arange(9), np.round(_GROWTH**growth).astype(np.int64)])
-    kinks = np.array([0, one, two, two - one, two + one])
-    around = kinks[:, np.newaxis] + np.concatenate([-distance, distance])
-    return np.unique(np.concatenate([around[(around >= 0) & (around <= last)], [0, last]]))
 
 
 def _between(lag: Counts, one: int, two: int) -> Floats:

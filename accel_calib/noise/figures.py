@@ -84,7 +84,7 @@ def _axis_notes(axis: AxisNoise) -> Iterator[str]:
         yield ('the curve falls with slope -1 at short τ: rounding of the output (quantisation '
                'noise); the white noise is that of longer τ')
     drift = axis.figures['drift']
-    if drift.seen and not _disturbed(axis):
+    if drift.seen and axis.tau[-1] <= axis.used[1]:
         hourly = _three(drift.value * scale * _HOUR)
         yield (f'a steady drift of {hourly} {unit} per hour raises the curve at long τ '
                '(warm-up?); it is not part of the figures')
@@ -93,8 +93,8 @@ def _axis_notes(axis: AxisNoise) -> Iterator[str]:
     below = ratio[axis.tau < axis.used[0]]
     above = ratio[axis.tau > axis.used[1]]
     if len(below) and np.max(np.abs(below)) > _DEPARTS:
-        why = 'a low-pass filter' if below[0] < 0.0 else 'vibration or rounding'
-        side = 'below' if below[0] < 0.0 else 'above'
+        side, why = (('below', 'a low-pass filter') if below[0] < 0.0 else
+                     ('above', 'vibration or rounding'))
         yield (f'for τ below {duration(axis.used[0])} the curve is {side} that of white noise '
                f'({why}); the figures are from longer τ')
     if len(above) and np.max(np.abs(above)) > _DEPARTS:
@@ -105,17 +105,6 @@ def _axis_notes(axis: AxisNoise) -> Iterator[str]:
     if axis.p_value < _LEAST_P:
         yield ('the curve does not have the form of white noise, bias instability and random walk '
                '(vibration?); the figures are approximate')
-
-
-def needs_of(axes: Sequence[AxisNoise], rest: LongRest) -> dict[tuple[Kind, str], str]:
-    """Return why figures are not seen, and what to do."""
-    longest: dict[tuple[Kind, str], tuple[float, str]] = {}
-    for axis in axes:
-        for figure in FIGURES:
-            if not axis.figures[figure].seen:
-                need, key = _need_of(axis, figure, rest), (axis.kind, figure)
-                longest[key] = max(longest.get(key, need), need)
-    return {key: words for key, (_, words) in longest.items()}
 
 
 def _need_of(axis: AxisNoise, figure: str, rest: LongRest) -> tuple[float, str]:
@@ -135,7 +124,7 @@ def _need_of(axis: AxisNoise, figure: str, rest: LongRest) -> tuple[float, str]:
             flat = FLAT * axis.figures['bias_instability'].upper**2
             hidden = _LENGTH_FOR_B * white.value**2 / flat if white.seen else 0.0
             seconds = max(_INSTABILITY_S, hidden)
-        if _disturbed(axis):
+        if axis.tau[-1] > axis.used[1]:  # the curve at long τ is not that of the components
             return np.inf, _DISTURBED
         seconds = max(seconds, 4.0 * rest.seconds)  # two octaves more
     # Rounded up to one or two digits of its unit.
@@ -146,22 +135,12 @@ def _need_of(axis: AxisNoise, figure: str, rest: LongRest) -> tuple[float, str]:
     return seconds, f'needs {about} at rest, this has {duration(rest.seconds)}'
 
 
-def _disturbed(axis: AxisNoise) -> bool:
-    """Return whether the curve at long τ is not that of the components."""
-    return bool(axis.tau[-1] > axis.used[1])
-
-
 def duration(seconds: float) -> str:
     """Return a duration in its usual unit, with two significant digits."""
-    if seconds >= 2.0 * _HOUR:
-        return f'{_two(seconds / _HOUR)} h'
-    if seconds >= 2.0 * _MINUTE:
-        return f'{_two(seconds / _MINUTE)} min'
-    return f'{_two(seconds)} s' if seconds >= 1.0 else f'{_two(seconds * 1e3)} ms'
-
-
-def _two(value: float) -> str:
-    return f'{value:.0f}' if value >= 10.0 else f'{value:.2g}'
+    units = (('h', _HOUR, 2.0), ('min', _MINUTE, 2.0), ('s', 1.0, 1.0))
+    value, unit = next(((seconds / size, unit) for unit, size, least in units
+                        if seconds >= least * size), (seconds * 1e3, 'ms'))
+    return f'{value:.0f} {unit}' if value >= 10.0 else f'{value:.2g} {unit}'
 
 
 def _three(value: float) -> str:
@@ -169,9 +148,8 @@ def _three(value: float) -> str:
     return f'{float(f"{value:.3g}"):g}'
 
 
-_POWERS = {'quantisation': 1.0, 'noise_density': 0.5, 'bias_instability': 0.0,
-           'random_walk': -0.5, 'drift': -1.0}
-"""Power of τ0 in each figure."""
+_POWERS = (1.0, 0.5, 0.0, -0.5, -1.0)
+"""Power of τ0 in each of `COMPONENTS`."""
 
 _MOST_RATE = 0.03
 """Noise density that no gyro in rad/s has [rad/s/√Hz]: 100 times that of a cheap one."""
@@ -221,10 +199,15 @@ def noise_of(recording: Recording, units: Units, gravity: float = STANDARD_GRAVI
         known = rest.temperature[np.isfinite(rest.temperature)]
         means = [float(np.mean(part)) for part in np.array_split(known, min(100, len(known)))]
         temperature = min(means), max(means)
+    needs: dict[tuple[Kind, str], tuple[float, str]] = {}  # the longest one of all axes
+    for each, figure in product(axes, FIGURES):
+        if not each.figures[figure].seen:
+            need, key = _need_of(each, figure, rest), (each.kind, figure)
+            needs[key] = max(needs.get(key, need), need)
     return NoiseFigures(
         axes=tuple(axes), start=rest.start, seconds=rest.seconds, samples=rest.samples,
         rate=rest.rate, temperature=temperature, notes=(*notes, *notes_of(axes, temperature)),
-        needs=needs_of(axes, rest))
+        needs={key: words for key, (_, words) in needs.items()})
 
 
 def _axis_noise(values: Floats, rate: float, spread: Spread, *, kind: Kind, axis: str, unit: str
@@ -233,13 +216,12 @@ def _axis_noise(values: Floats, rate: float, spread: Spread, *, kind: Kind, axis
     size = float(np.std(values))
     variances = np.maximum(allan_variances(values / size, lengths), _LEAST_VARIANCE)
     fitted = fit_components(variances, lengths, spread)
-    covariance = spread.covariance(fitted.squares)
-    expected = shares(lengths) @ fitted.squares
     # Beyond the range the form is not known: a random walk has the fewest degrees of freedom.
     forms = (fitted.squares, np.array([0.0, 0.0, 0.0, 1.0, 0.0]))
-    within, beyond = (2.0 * (shares(lengths) @ squares)**2 / np.diag(spread.covariance(squares))
-                      for squares in forms)
-    freedom = np.where(np.arange(len(variances)) > fitted.last, beyond, within)
+    expected, walk = (shares(lengths) @ squares for squares in forms)
+    covariance, of_walk = map(spread.covariance, forms)
+    freedom = 2.0 * np.where(np.arange(len(variances)) > fitted.last,
+                             walk**2 / np.diag(of_walk), expected**2 / np.diag(covariance))
     low, high = (np.sqrt(variances * freedom / scipy.stats.chi2.ppf(part, freedom))
                  for part in (0.5 + 0.5 * LEVEL, 0.5 - 0.5 * LEVEL))
     tau = lengths / rate
@@ -250,8 +232,8 @@ def _axis_noise(values: Floats, rate: float, spread: Spread, *, kind: Kind, axis
         low=size * low, high=size * high, model=size * np.sqrt(expected),
         slope=0.5 * np.diff(np.log2(variances)),
         slope_sd=0.5 / np.log(2.0) * np.sqrt(np.diag(across @ relative @ across.T)),
-        figures={name: each.times(size * (1.0 / rate) ** _POWERS[name])
-                 for name, each in zip(COMPONENTS, fitted.components, strict=True)},
+        figures={name: each.times(size * (1.0 / rate) ** power) for name, each, power in
+                 zip(COMPONENTS, fitted.components, _POWERS, strict=True)},
         used=(float(tau[fitted.first]), float(tau[fitted.last])), p_value=fitted.p_value,
         step=coarse_step(values, size * float(np.sqrt(variances[0]))))
 

@@ -18,7 +18,7 @@ The search for missing effects.
    the better description.
 6. In the final model, an effect is removed if it is not significant or does not lower the held-out
    residual, and gives way to one that is more probable in its place.
-7. If a scatter that all poses have (`accel_calib.estimate.scatter`) is as good an explanation as
+7. If a scatter that all poses have (`accel_calib.estimate.outliers`) is as good an explanation as
    what was found, the search is repeated with it as part of the noise.
 
 A set is kept only if its fit converged, the cost decreased and its values are plausible.
@@ -30,6 +30,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +43,8 @@ from .linear import LEVEL, Set
 from .settle import fit_without, make_sound, settle
 from .state import beginning, Candidate, fitted_state, linearised, State, without
 from ..effects import (
-    CHANGES, covariates_of, EffectKey, EFFECTS, entry_of, factors_of, included, LADDER,
-    linear_values, Model, OwnEffect, parameter_names, products_of, WANDER)
+    CHANGES, Covariate, COVARIATES, EffectKey, EFFECTS, entry_of, factors_of, included, LADDER,
+    linear_values, Model, OwnEffect, parameter_names, WANDER)
 from ..estimate import beside_scatter, kinds, scatter_of, stated
 from ..table import CONTEXT, Floats, Poses
 
@@ -208,12 +209,16 @@ def _search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
     present = {*map(str, fixed)}
     names: tuple[EffectKey, ...] = (
         *_visible(begun, LADDER), *(name for name in EFFECTS if name not in LADDER),
-        *(own for own in also if own.name not in present), *covariates_of(causes(poses_g)),
+        *(own for own in also if own.name not in present),
+        *(Covariate(part, (quantity,), power) for quantity in causes(poses_g)
+          for part in COVARIATES for power in (1, 2)),
         *_visible(begun, CHANGES))
     state, near, trial = settle(begun, poses_g, fixed, names)
     varied = {*causes(poses_g), *(column for column in CONTEXT if column in poses_g)}
     if len(varied) <= _MOST_VARIED and (near.walk is not None or not state.is_noise):
-        products: tuple[EffectKey, ...] = tuple(products_of(varied))
+        products: tuple[EffectKey, ...] = tuple(
+            Covariate(part, pair) for pair in combinations(sorted(varied), 2)
+            for part in COVARIATES)
         beside = settle(begun, poses_g, fixed, (*names, *products))
         if not {*products}.isdisjoint(beside[1].names):
             state, near, trial = beside

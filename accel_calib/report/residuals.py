@@ -213,16 +213,17 @@ def sphere_map(residuals: Residuals, name: str, title: str, limit: float, *, mor
     marks, hover = _marks(residuals), dict[str, Marks]()
     with drawn(HEIGHT_INCHES, title, columns=2, grid='') as (figure, discs):
         for disc, half, up in _hemispheres(discs):
-            here = _inside(force, up)
-            here = here[np.argsort(np.abs(values[here]))]
+            here, places = _on_map(force, up)
+            order = np.argsort(np.abs(values[here]))
+            here = here[order]
             scattered = disc.scatter(
-                *_equal_area(force[here]).T, c=values[here], edgecolors=INK, linewidths=0.5,
+                *places[order].T, c=values[here], edgecolors=INK, linewidths=0.5,
                 s=min(_INK_PER_POSE / max(len(force), 12), 130.0), gid=half, zorder=3,
                 cmap=DIVERGING if signed else SEQUENTIAL,
                 vmin=-limit if signed else 0.0, vmax=limit)
             hover[half] = tuple(marks[k] for k in here)
-            out = _inside(residuals.left_out_force, up)
-            places, rows = _equal_area(residuals.left_out_force[out]), residuals.left_out.row[out]
+            out, places = _on_map(residuals.left_out_force, up)
+            rows = residuals.left_out.row[out]
             disc.plot(*places.T, linestyle='none', marker='s', markersize=8, fillstyle='none',
                       color=ACCENT, zorder=4, gid=f'out_{half}')
             for place, row in zip(places, rows, strict=True):
@@ -256,15 +257,11 @@ def _hemispheres(discs: Sequence[Any]) -> Iterator[tuple[Any, str, bool]]:
         yield disc, name, name == 'up'
 
 
-def _inside(force: Floats, up: bool) -> NDArray[np.intp]:
-    """Return the indices of the (n, 3) directions in a hemisphere."""
-    return np.flatnonzero((force[:, 2] >= 0.0) == up)
-
-
-def _equal_area(force: Floats) -> Floats:
-    """Return the (n, 2) positions of (n, 3) directions on the maps, which are unit discs."""
-    towards = unit(force)
-    return unit(towards[:, :2]) * np.sqrt(1.0 - np.abs(towards[:, 2:]))
+def _on_map(force: Floats, up: bool) -> tuple[NDArray[np.intp], Floats]:
+    """Return the indices of the directions in a hemisphere, and their (k, 2) places on its map."""
+    here = np.flatnonzero((force[:, 2] >= 0.0) == up)
+    towards = unit(force[here])
+    return here, unit(towards[:, :2]) * np.sqrt(1.0 - np.abs(towards[:, 2:]))
 
 
 def against(residuals: Residuals, variables: Sequence[Variable], name: str, title: str,
@@ -295,15 +292,14 @@ def of_coverage(residuals: Residuals, share: float, next_pose: Floats | None) ->
     open_ = uncovered(force)
     with drawn(HEIGHT_INCHES, title, columns=2, grid='') as (figure, discs):
         for disc, half, up in _hemispheres(discs):
-            here = _inside(force, up)
+            here, places = _on_map(force, up)
             hover[half] = tuple(marks[k] for k in here)
-            disc.plot(*_equal_area(open_[_inside(open_, up)]).T, 'x', color=ACCENT,
-                      markersize=3.5, label='not covered', zorder=2)
-            disc.plot(*_equal_area(force[here]).T, 'o', color=AFTER, markeredgecolor=PAPER,
-                      markersize=7, label='pose', zorder=3, gid=half)
+            disc.plot(*_on_map(open_, up)[1].T, 'x', color=ACCENT, markersize=3.5,
+                      label='not covered', zorder=2)
+            disc.plot(*places.T, 'o', color=AFTER, markeredgecolor=PAPER, markersize=7,
+                      label='pose', zorder=3, gid=half)
             if next_pose is not None:
-                asked = next_pose[np.newaxis]
-                disc.plot(*_equal_area(asked[_inside(asked, up)]).T, '*', color=ACCENT,
+                disc.plot(*_on_map(next_pose[np.newaxis], up)[1].T, '*', color=ACCENT,
                           markersize=14, label='next pose', zorder=4)
         legend_below(figure, 3, *discs[0].get_legend_handles_labels())
     return Drawing('coverage', title, figure, hover)

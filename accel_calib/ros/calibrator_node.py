@@ -68,8 +68,7 @@ _ASKED_FOR = (1.0, 0.6, 0.0, 1.0)
 _WORDS = (1.0, 1.0, 1.0, 1.0)
 _SPHERE = (0.6, 0.6, 0.7, 0.15)
 _NUMBER_AT, _WORDS_AT = 1.12, 1.35
-_CENTRE = np.zeros(3)
-_ABOVE = np.array([0.0, 0.0, _WORDS_AT])
+_CENTRE, _ABOVE = np.zeros(3), np.array([0.0, 0.0, 1.0])
 _DOT, _LETTER, _SHAFT = 0.1, 0.1, 0.04
 
 
@@ -85,14 +84,14 @@ def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerAr
         markers += [_marker('poses', k, _CAPTURED, _DOT, direction),
                     _marker('numbers', k, _WORDS, _LETTER, direction * _NUMBER_AT,
                             text=str(k + 1))]
-    words_at = _ABOVE
+    up = _ABOVE if asked.direction is None else asked.direction
     if asked.direction is not None:
-        words_at = asked.direction * _WORDS_AT
         arrow = _marker('next', 0, _ASKED_FOR, _SHAFT)
         arrow.type, arrow.scale.y, arrow.scale.z = Marker.ARROW, 2.0 * _SHAFT, 2.0 * _SHAFT
-        arrow.points = [Point(), Point(**dict(zip('xyz', asked.direction.tolist())))]
+        arrow.points = [Point(), Point(**dict(zip('xyz', up.tolist())))]
         markers.append(arrow)
-    markers.append(_marker('next', 1, _WORDS, _LETTER, words_at, text=request_words(asked)))
+    markers.append(_marker('next', 1, _WORDS, _LETTER, up * _WORDS_AT,
+                           text=request_words(asked)))
     for marker in markers:
         marker.header.frame_id = frame_id
     return MarkerArray(markers=markers)

@@ -139,7 +139,7 @@ def mismatches(node: Node) -> tuple[str, ...]:
              for other in node.get_publishers_info_by_topic(own.topic_name)]
     pairs += [(own, other, False) for own in node.publishers
               for other in node.get_subscriptions_info_by_topic(own.topic_name)]
-    lines = {}
+    lines: dict[str, None] = {}
     for own, other, receives in pairs:
         offered, wanted = own.qos_profile, other.qos_profile
         if receives:
@@ -209,12 +209,12 @@ class StaticTransforms:
                              f'expected that {child} is not above {parent}',
                              'correct the node that publishes it, or restart this node if the '
                              'frames were rearranged')
-        x, y, z, w = quaternion
-        squared = x * x + y * y + z * z + w * w
+        squared = sum(part * part for part in quaternion)
         if not abs(squared - 1.0) < _LENGTH_TOLERANCE:  # NaN too
+            words = ', '.join(f'{part:g}' for part in quaternion)
             raise InputError(
-                f'the static transform from {parent} to {child} has the quaternion ({x:g}, {y:g}, '
-                f'{z:g}, {w:g}) of length {math.sqrt(squared):.3g}, expected length 1',
+                f'the static transform from {parent} to {child} has the quaternion ({words}) of '
+                f'length {math.sqrt(squared):.3g}, expected length 1',
                 'correct the node that publishes it')
         rotation = rotation_from_quaternion(quaternion)
         before = self.parents.get(child)

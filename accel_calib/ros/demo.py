@@ -221,7 +221,8 @@ class User(Node):
         """Put the robot flat, and call ``~/set_level`` as soon as the rest is long enough."""
         self.turn('flat')
         for count in range(_SETTLED, _LONGEST_REST, _SETTLED):
-            self._spin(lambda wanted=count: len(self._rest('raw')) >= wanted, 'a longer rest')
+            self._spin(partial(lambda wanted: len(self._rest('raw')) >= wanted, count),
+                       'a longer rest')
             with suppress(AccelCalibError):
                 return self.call('calibrator/set_level')
         return self.call('calibrator/set_level')

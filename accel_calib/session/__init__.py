@@ -5,8 +5,8 @@
 The calibrator without ROS: it takes samples and commands, and returns answers and events.
 
 `session` is the entry point, and `core` the state that all other modules read. `commands` contains
-what the user can ask for, `fitting` their computations, and `use` what follows when the
-calibration or the poses change.
+what the user can ask for, and `use` their computations and what follows when the calibration or
+the poses change.
 `sensor` is what belongs to one sensor: `live_capture` captures its poses, and `pose_guide` chooses
 the next one. `stream` describes the messages. `conditions` is what is the case, and the next step,
 and `state` is what topics and pages show. `store` manages and locks files.
@@ -18,7 +18,7 @@ one way.
 from . import state
 from .commands import BUTTONS, COMMANDS, enable, run
 from .conditions import APART, conditions, next_step
-from .core import State, Surroundings
+from .core import Surroundings
 from .sensor import title
 from .session import BATCH, Session
 from .settings import (
@@ -33,7 +33,7 @@ from .worker import (
 __all__ = ['APART', 'BATCH', 'BUTTONS', 'COMMANDS', 'WEB_PORT', 'Answer', 'Around',
            'CalibratorSettings', 'CallSoon', 'Check', 'Compute', 'Event', 'Files', 'Log',
            'Mounting', 'Progress', 'Result', 'Session', 'Settings', 'Severity', 'ShowPoses',
-           'State', 'Step', 'Still', 'Surroundings', 'Task', 'Throttle', 'Worker',
+           'Step', 'Still', 'Surroundings', 'Task', 'Throttle', 'Worker',
            'WorkerProcess', 'answered', 'changed', 'columns_of', 'conditions', 'default_of',
            'diagnostics', 'enable', 'expected', 'figures', 'next_step', 'nothing', 'parameter',
            'progress', 'ros_home', 'run', 'state', 'title', 'words_of_state']

@@ -20,13 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from . import fitting
+from . import use
 from .conditions import next_words, thermometer_words
 from .core import Holder, State
-from .fitting import change_words, Fitted
 from .sensor import gyro_bias_of_rest, Sensor
 from .store import writing_advice
-from .use import adopt, rate, show_poses
+from .use import adopt, change_words, Fitted, rate, show_poses
 from .worker import Compute, Files, nothing, Parse, Part, Task
 from ..calibration import (
     Calibration, fit_partial, level, mounting_only, plan_session, set_heading as with_heading)
@@ -130,7 +129,7 @@ def _auto_fit(session: Holder, sensor: Sensor) -> Task:
         session.change_sensor(refusal=str(error))
         raise
     session.change_sensor(refusal='')
-    if not fitting.differs(before, fitted.calibration):
+    if not use.differs(before, fitted.calibration):
         return ''
     return (yield from _use(session, fitted, offers=False))
 
@@ -139,14 +138,14 @@ def _auto_fit(session: Holder, sensor: Sensor) -> Task:
 
 def fit(session: Holder) -> Part[Fitted]:
     """Fit the poses; the values of a refined calibration are fitted anew."""
-    return (yield from _compute(session, fitting.fit, settings=session.state.settings))
+    return (yield from _compute(session, use.fit, settings=session.state.settings))
 
 
 def refine(session: Holder) -> Part[Fitted]:
     """Refine the calibration."""
     state = session.state
     hint = '' if 'temperature' in state.around.values else thermometer_words(state)
-    fitted = yield from _compute(session, fitting.refine, hint=hint, own=state.own)
+    fitted = yield from _compute(session, use.refine, hint=hint, own=state.own)
     guide, planned = session.sensor.guide, fitted.refinement.plan.poses
     session.change_sensor(guide=replace(guide, planned=planned or None, begun=guide.poses))
     return fitted

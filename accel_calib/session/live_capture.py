@@ -296,12 +296,11 @@ def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
     found, times = [], np.array([dwell.time for dwell in known])
     for dwell in dwells:
         away = np.abs(times - dwell.time)
-        lacks = 'temperature' not in dwell.context
-        if lacks and np.min(away, initial=np.inf) <= _SAME_TEMPERATURE:
+        is_near = np.min(away, initial=np.inf) <= _SAME_TEMPERATURE
+        if is_near and 'temperature' not in dwell.context:
             warm = known[int(np.argmin(away))].context['temperature']
-            found.append(replace(dwell, context={**dwell.context, 'temperature': warm}))
-        else:
-            found.append(dwell)
+            dwell = replace(dwell, context={**dwell.context, 'temperature': warm})
+        found.append(dwell)
     return found
 
 

@@ -16,12 +16,11 @@ from .account import account_of, Rest
 from .chunks import CaptureSettings, REPEATED, Repeated, settings_from
 from .detector import capture, Captured, poses_from, samples_of, select, StillDetector
 from .dwell import Dwell
-from .ramp import (
-    cells_of, FASTEST, is_turned_over, LEAST_RANGE, LEAST_RESTS, Ramp, ramp_of, rests_in_cells)
+from .ramp import cells_of, is_turned_over, LEAST_RANGE, LEAST_RESTS, Ramp, ramp_of, rests_in_cells
 from .rule import rounding_left
 from .sensor import check_axes, check_measured, is_one_direction
 
-__all__ = ['FASTEST', 'LEAST_RANGE', 'LEAST_RESTS', 'REPEATED', 'Captured',
+__all__ = ['LEAST_RANGE', 'LEAST_RESTS', 'REPEATED', 'Captured',
            'CaptureSettings', 'Dwell', 'Ramp', 'Repeated', 'Rest', 'StillDetector', 'account_of',
            'capture', 'cells_of', 'check_axes', 'check_measured', 'is_one_direction',
            'is_turned_over', 'poses_from', 'ramp_of', 'rests_in_cells', 'rounding_left',

@@ -246,10 +246,8 @@ class Chunker:
         self._least = [np.inf, np.inf]
         self._highest = np.full(6, -np.inf)
         self._origin: Floats = np.empty(0)
-        self._length = self._epoch = self._latest = self._period = 0.0
-        self._pending: Floats = np.empty(0)
+        self._length = self._epoch = self._latest = 0.0
         self.interruptions: deque[Interruption] = deque(maxlen=10_000)
-        self.fresh = True  # the present segment has no chunk yet
         self.restart()
 
     def feed(self, samples: Floats, last: bool) -> Iterator[Chunks]:
@@ -296,9 +294,9 @@ class Chunker:
 
     def restart(self) -> None:
         """Start a new segment with the next sample."""
-        self._pending = np.empty((4, 0))
-        self._period = -1.0
-        self.fresh = True
+        self._pending: Floats = np.empty((4, 0))
+        self._period = -1.0  # not known yet
+        self.fresh = True  # the segment has no chunk yet
 
     def _sum(self, samples: Floats, starts: Indices) -> Records:
         """

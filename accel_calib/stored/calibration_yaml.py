@@ -449,7 +449,7 @@ def _fleets_in(data: bytes, path: Path) -> list[FleetPrior]:
             if not np.allclose(covariance, covariance.T):
                 raise ValueError('covariance is not symmetric')
             prior = Prior(array_at(each, 'mean', (size,), most=LARGEST_OFFSET_G), covariance)
-            _ = prior.whitening  # raises LinAlgError unless it is positive definite
+            _ = prior.root  # raises LinAlgError unless it is positive definite
             if not 1 <= (sensors := value_at(each, 'sensors', int)) <= _MOST_SENSORS:
                 raise ValueError(f'sensors is {shown(sensors)}, expected 1 to {_MOST_SENSORS}')
             found.append(FleetPrior(str(each['model']), sensors, prior))

@@ -271,18 +271,15 @@ def write_plan(path: Path, plan: PosePlan) -> None:
 
     """
     columns = {**{key: (key, 1.0) for pose in plan.poses for key in pose.context}, **_CONTEXT}
-
-    def write(file: TextIO) -> None:
-        file.writelines(f'# {one_line(line)}\n' for line in plan_lines(plan))
-        writer = csv.writer(file, lineterminator='\n')
-        writer.writerow(['pose', 'up_x', 'up_y', 'up_z', 'attitude',
-                         *(name for name, _ in columns.values()), 'separates',
-                         'expected_probability'])
-        for number, pose in enumerate(plan.poses, 1):
-            context = [format(pose.context[key] * scale, '.6g') if key in pose.context else ''
-                       for key, (_, scale) in columns.items()]
-            writer.writerow([number, *(f'{part:.6f}' for part in pose.up),
-                             attitude_words(np.array(pose.up)), *context,
-                             ' / '.join(map(str, pose.separates)), f'{pose.expected:.4f}'])
-
-    write_atomically(path, write)
+    text = io.StringIO()
+    text.writelines(f'# {one_line(line)}\n' for line in plan_lines(plan))
+    writer = csv.writer(text, lineterminator='\n')
+    writer.writerow(['pose', 'up_x', 'up_y', 'up_z', 'attitude',
+                     *(name for name, _ in columns.values()), 'separates', 'expected_probability'])
+    for number, pose in enumerate(plan.poses, 1):
+        context = [format(pose.context[key] * scale, '.6g') if key in pose.context else ''
+                   for key, (_, scale) in columns.items()]
+        writer.writerow([number, *(f'{part:.6f}' for part in pose.up),
+                         attitude_words(np.array(pose.up)), *context,
+                         ' / '.join(map(str, pose.separates)), f'{pose.expected:.4f}'])
+    write_atomically(path, lambda file: file.write(text.getvalue()))

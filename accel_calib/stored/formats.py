@@ -71,8 +71,8 @@ _LARGEST_COUNT = 32767
 _UNIT_GAIN, _LARGEST_GAIN = 4096, 8192
 """The gain 1 of iNav, and the largest one of its settings.yaml."""
 
-_TO_FRD = np.array([1.0, -1.0, -1.0])
-"""Signs of the axes x forward, y left, z up, in those of an autopilot."""
+_SIGNS = {'flu': np.array([1.0, -1.0, -1.0]), 'same': np.ones(3)}
+"""Signs of the axes of readings, in those of an autopilot."""
 
 _AXES = {'flu': 'the calibration is in x forward, y left, z up; these values are turned by 180 '
                 'deg about x to x forward, y right, z down',
@@ -112,7 +112,7 @@ def _fit_by_axis(calibration: Calibration, options: Options, reference: float | 
         # From a polynomial in s to one in T - reference.
         parts = Polynomial(-found[1:] / found[0])(inner).coef
         scale[axis], offset[:len(parts), axis] = found[0], parts
-    offset *= _signs(options)
+    offset *= _SIGNS[options.axes]
     return ByAxis(offset[0], scale, offset[1:], reference, (low, high))
 
 
@@ -179,7 +179,7 @@ def _made(rows: Parameters, found: ByAxis, calibration: Calibration, options: Op
     """Return parameters with the correction by their values, in single precision."""
     written = replace(found, offset=single(found.offset), scale=single(found.scale),
                       thermal=single(found.thermal))
-    signs, per_g = _signs(options), calibration.units.per_g
+    signs, per_g = _SIGNS[options.axes], calibration.units.per_g
     notes = (f'do not load this file: the readings were corrected already, and by what is not '
              f'known ({place.corrected})',) if place.corrected else ()
     return Made({'rows': rows}, lambda reading, temperature: written.correct(
@@ -196,7 +196,7 @@ def counts(calibration: Calibration, options: Options, label: str, with_gain: bo
     smallest change of zero. InputError is raised for values that the program refuses.
 
     """
-    signs, units, per_g = _signs(options), calibration.units, options.counts_per_g
+    signs, units, per_g = _SIGNS[options.axes], calibration.units, options.counts_per_g
     if per_g is None:  # a power of two near that of the readings
         per_g = (float(2.0 ** np.round(np.log2(units.per_g))) if units.is_native
                  else _COUNTS_PER_G)
@@ -223,10 +223,6 @@ def counts(calibration: Calibration, options: Options, label: str, with_gain: bo
     return Made(values, lambda reading, temperature: (
         reading * factor * signs - zero) * signs * gain / (_UNIT_GAIN * unit), False,
         (_AXES[options.axes], f'1 g = {unit:g} counts'), notes=notes, rounded=rounded)
-
-
-def _signs(options: Options) -> Floats:
-    return _TO_FRD if options.axes == 'flu' else np.ones(3)
 
 
 def _device(options: Options, prefix: str) -> Parameters:
