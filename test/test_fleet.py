@@ -34,7 +34,8 @@ from faults.sample import FACTOR, sample
 from fleet_case import (
     found_in, OFFSET, page_of, QUICK, rows_of, state_of, write_fleet, write_poses)
 from inside import (
-    alike, as_folder, COMMAND, content_hash, date_of, export, main, mapped, on_disk, sensor_of)
+    alike, as_folder, COMMAND, content_hash, date_of, export, main, mapped, on_disk, overview,
+    sensor_of)
 import numpy as np
 import pytest
 from shared import OWN, python, run_on_small_disk, run_snippets, table, wait
@@ -98,7 +99,7 @@ def test_each_recording_becomes_a_row_and_a_calibration_on_the_workers(
     write_fleet(tmp_path / 'in', 6, 2)
     (tmp_path / 'in' / 'bad.csv').write_text('nothing of use\n')
     for where, name in (
-            (Store, 'merge'), (sys.modules['accel_calib.fleet.overview'], 'read_parquet')):
+            (Store, 'merge'), (sys.modules[overview.__module__], 'read_parquet')):
         monkeypatch.setattr(where, name, None)  # in this process, which must not need them
     summary = calibrate()
     assert summary.counts == {'ok': 12, 'error': 1}
