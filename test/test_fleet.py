@@ -98,8 +98,7 @@ def test_each_recording_becomes_a_row_and_a_calibration_on_the_workers(
         calibrate: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_fleet(tmp_path / 'in', 6, 2)
     (tmp_path / 'in' / 'bad.csv').write_text('nothing of use\n')
-    for where, name in (
-            (Store, 'merge'), (sys.modules[overview.__module__], 'read_parquet')):
+    for where, name in ((Store, 'merge'), (sys.modules[overview.__module__], 'read_parquet')):
         monkeypatch.setattr(where, name, None)  # in this process, which must not need them
     summary = calibrate()
     assert summary.counts == {'ok': 12, 'error': 1}

@@ -51,6 +51,13 @@ MODES = 24
 """Number of cosines that an empirical curve can have."""
 
 
+def _wave(turn: float) -> list[Monomial]:
+    """Return the cosines over -1 to 1 g that turn by this angle [rad/g]."""
+    return each_axis(
+        lambda u: np.cos(turn * (np.clip(u, -1.0, 1.0) + 1.0)),
+        lambda u: -turn * np.sin(turn * (np.clip(u, -1.0, 1.0) + 1.0)) * (abs(u) < 1.0))
+
+
 DEGREES = (3, 4, 5, 6)
 """Degrees of the spherical harmonics of which a gain that depends on the direction consists. Those
 of lower degree are offsets, gains and cross-axis gains."""
@@ -121,11 +128,7 @@ MONOMIALS: tuple[Monomial, ...] = (
     Monomial(lambda x, y, z: x * y, lambda x, y, z: (y, x, 0.0)),
     Monomial(lambda x, y, z: x * z, lambda x, y, z: (z, 0.0, x)),
     Monomial(lambda x, y, z: y * z, lambda x, y, z: (0.0, z, y)),
-    *(monomial for turn in (np.pi / 2.0 * np.arange(1, MODES + 1)).tolist()
-      for monomial in each_axis(
-          lambda u, turn=turn: np.cos(turn * (np.clip(u, -1.0, 1.0) + 1.0)),
-          lambda u, turn=turn: -turn * np.sin(
-              turn * (np.clip(u, -1.0, 1.0) + 1.0)) * (abs(u) < 1.0))),
+    *(monomial for mode in range(1, MODES + 1) for monomial in _wave(mode * np.pi / 2.0)),
     *(monomial for zone in ZONES for monomial in zone.monomials()),
 )
 """1; u_i; u_i²; u_i³; u_i|u_i|; |u_i|; u_x u_y, u_x u_z, u_y u_z; cos(k π (u_i + 1) / 2) for each

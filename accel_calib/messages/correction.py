@@ -250,7 +250,8 @@ class Rewriter:
             p, q, r = rate = p - u, q - v, r - t
         if self._turns:
             if has_orientation:
-                attitude = _product(*attitude, *self._quaternion)
+                x, y, z, w = attitude
+                attitude = _product(x, y, z, w, *self._quaternion)
             d, e, f, g, h, i, j, k, m = self._turn
             rate = d * p + e * q + f * r, g * p + h * q + i * r, j * p + k * q + m * r
         return head + _FRONT.pack(*attitude, new_orientation, *rate, new_rate)
