@@ -182,8 +182,7 @@ def test_runs_at_other_temperatures_agree_when_they_correct_for_it():
 
     cold, warm = run(15.0), run(35.0)
     assert compare([cold[1], warm[1]]).agree
-    found = compare([cold[0], warm[0]])
-    assert not found.agree
+    assert not compare([cold[0], warm[0]]).agree
 
 
 LEAST, NOISE = 0.001, 0.0003

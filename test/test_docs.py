@@ -96,19 +96,16 @@ def test_links_lead_somewhere(page):
         target = (ROOT / page).parent / link if link else ROOT / page
         assert target.exists(), link
         if anchor:
-            assert anchor[1:] in anchors_of(target), anchor
+            # Anchors that GitHub makes of headings
+            headings = re.findall(r'^#+ (.+)$', target.read_text('utf-8').lower(), re.MULTILINE)
+            assert anchor[1:] in {re.sub(r'[^\w\- ]', '', heading).replace(' ', '-')
+                                  for heading in headings}, anchor
 
 
 @pytest.mark.parametrize('page', OWN_PAGES)
 def test_named_files_exist(page):
     for path in re.findall(r'`((?:\w+/)+\w+\.(?:py|xml))`', text_of(page)):
         assert (ROOT / path).exists() or (ROOT / 'accel_calib' / path).exists(), path
-
-
-def anchors_of(path):
-    """Return the anchors that GitHub makes of the headings of a page."""
-    headings = re.findall(r'^#+ (.+)$', path.read_text(encoding='utf-8'), re.MULTILINE)
-    return {re.sub(r'[^\w\- ]', '', heading.lower()).replace(' ', '-') for heading in headings}
 
 
 def test_services_and_topics_of_the_docs_are_those_of_the_node():

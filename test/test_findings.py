@@ -212,8 +212,7 @@ def test_a_calibration_that_is_worse_than_none_is_bad():
     ideal = {'offset': [0.001, -0.001, 0.0005]}
     calibration = ac.fit(simulated(ideal, poses=11, noise=0.25, seed=2), model='10')
     assert error_mg(calibration, model_with(ideal)) > 5.0
-    rating = rate(calibration)
-    assert rating.name == 'BAD'
+    assert rate(calibration).name == 'BAD'
 
 
 @pytest.mark.parametrize(('noise', 'expected'), [(0.001, 'GOOD'), (0.02, 'USABLE')])

@@ -34,7 +34,7 @@ from faults.sample import FACTOR, sample
 from fleet_case import (
     found_in, OFFSET, page_of, QUICK, rows_of, state_of, write_fleet, write_poses)
 from inside import (
-    alike, as_folder, COMMAND, content_hash, date_of, digest_of, export, main, mapped, on_disk,
+    alike, as_folder, COMMAND, content_hash, date_of, export, main, mapped, on_disk, overview,
     sensor_of)
 import numpy as np
 import pytest
@@ -98,9 +98,8 @@ def test_each_recording_becomes_a_row_and_a_calibration_on_the_workers(
         calibrate: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_fleet(tmp_path / 'in', 6, 2)
     (tmp_path / 'in' / 'bad.csv').write_text('nothing of use\n')
-    # This process must neither merge rows nor read those of the sensors.
-    monkeypatch.setattr(Store, 'merge', None)
-    monkeypatch.setitem(digest_of.__globals__, 'read_parquet', None)
+    for where, name in ((Store, 'merge'), (sys.modules[overview.__module__], 'read_parquet')):
+        monkeypatch.setattr(where, name, None)  # in this process, which must not need them
     summary = calibrate()
     assert summary.counts == {'ok': 12, 'error': 1}
     assert summary.priors[''].sensors == 6

@@ -230,5 +230,4 @@ def test_correct_wiring_causes_no_warning(seed):
 
 def test_a_knocked_pose_does_not_hide_the_fault():
     poses = wired(np.diag([1.0, -1, 1]))
-    poses = changed(poses, 3, plus=0.3)
-    assert 'y reads -y' in fit_poses(poses, G).warnings[0]
+    assert 'y reads -y' in fit_poses(changed(poses, 3, plus=0.3), G).warnings[0]

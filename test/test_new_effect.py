@@ -320,8 +320,7 @@ def test_firmware_has_what_depends_on_columns_and_is_refused_for_functions_of_th
     for name, status in (('thermal_knee', 0), ('dead_band', 2)):
         poses, _ = poses_with(own_effects[name], 4)
         ac.refine(poses, also=[own_effects[name]]).calibration.save('own.yaml')
-        assert run('export', 'own.yaml', '--to', 'c', '-o', 'own.h', '--also',
-                   'own.py') == status
+        assert run('export', 'own.yaml', '--to', 'c', '-o', 'own.h', '--also', 'own.py') == status
         assert ('of the force (dead_band)' in capsys.readouterr().err) == (status == 2)
 
 

@@ -280,8 +280,7 @@ def test_page_is_complete_and_self_contained(warm):
     assert not re.search(r'https?:|//[a-z]|<link|<img|@import|src=|fetch|XMLHttp|WebSocket', text)
     assert '<html lang="en">' in text
     assert 'name="viewport"' in text
-    assert '<b onload' not in text
-    assert '&lt;b onload=&#34;x&#34;&gt;&amp;.csv' in text
+    assert text.count('b onload') == text.count('&lt;b onload=&#34;x&#34;&gt;&amp;.csv') > 0
 
 
 def test_figure_of_a_curve_shows_the_truth_within_its_band():

@@ -117,8 +117,7 @@ def test_every_person_ends_in_a_calibration_or_in_one_named_reason(
     assert len(person.called) == len(set(person.called)) or case.ends == 'done'
 
 
-def test_axes_of_a_driver_are_named_after_two_rests_and_poses_are_asked_for_as_they_read(
-        ) -> None:
+def test_axes_of_a_driver_are_named_after_two_rests_and_poses_are_asked_for_as_they_read() -> None:
     for axes, words in ((INVERTED, 'the z axis of the readings is probably inverted'),
                         (SWAPPED, '+x reads +y, +y reads +x')):
         driver = Driver(sensor=words[4:9])
@@ -355,7 +354,8 @@ def test_slow_motion_by_hand_is_named_while_a_pose_is_waited_for() -> None:
     driver.feed(GRAVITY * (up @ GAIN + OFFSET + noise))
     action = next_step(driver.session.state)
     number, = re.findall(r'([\d.]+) °/s', action.text)
-    assert action.kind == 'poses' and abs(float(number) - 0.9) < 0.2
+    assert action.kind == 'poses'
+    assert abs(float(number) - 0.9) < 0.2
 
 
 def test_an_upside_down_sensor_is_asked_about_once_unless_its_mounting_is_given() -> None:
@@ -375,8 +375,7 @@ def test_an_upside_down_sensor_is_asked_about_once_unless_its_mounting_is_given(
 
 def test_an_effect_far_beyond_those_of_parts_is_reported_and_not_used() -> None:
     driver = Driver()
-    driver.session.change(surroundings=Surroundings(
-        thermometers=('/board/temperature', '/cpu')))
+    driver.session.change(surroundings=Surroundings(thermometers=('/board/temperature', '/cpu')))
 
     def unseen(up: Any, temperature: float) -> Any:
         return healthy(up, temperature) + 3.0 * EFFECT * (temperature - 25.0)

@@ -149,8 +149,7 @@ def planned(up, **context):
 
 def guide_at(guide, up):
     asked = NextPose(np.array([1.0, 0.0, 0.0]), 0.5, 12, True)
-    return guide.choose(
-        SessionPlan(asked, len(up), np.array(up, float).reshape(-1, 3), 1e-4, 0.5))
+    return guide.choose(SessionPlan(asked, len(up), np.array(up, float).reshape(-1, 3), 1e-4, 0.5))
 
 
 def test_the_node_asks_for_the_poses_of_the_plan_and_then_for_refine():

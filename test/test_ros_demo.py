@@ -86,8 +86,7 @@ def test_the_node_is_turned_by_its_services(bench: Any) -> None:
     assert call('next').success
     bench.spin(lambda: np.allclose(up(), second) and all(
         each.vector == truth[-1].vector for each in truth[-100:]))
-    refused = call('next')
-    assert not refused.success
+    assert not call('next').success
     assert call('flat').success
     bench.spin(lambda: up() == (0.0, 0.0, 9.80665))
 

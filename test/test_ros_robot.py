@@ -322,8 +322,7 @@ def test_busy_nodes_end_with_status_0_and_without_words(bench: Any, stored: Stor
         for end in ('.yaml', '_poses.csv'):
             shutil.copy(path.with_name(f'{path.stem}{end}'), path.with_name(f'{name}{end}'))
         nodes.append(bench.run(
-            *CALIBRATOR, '--ros-args', '-r', f'__ns:=/{name}',
-            '-r', 'imu/data_raw:=/imu/data_raw',
+            *CALIBRATOR, '--ros-args', '-r', f'__ns:=/{name}', '-r', 'imu/data_raw:=/imu/data_raw',
             '-p', f'calibration_file:={path.with_name(name)}.yaml'))
         clients.append(bench.node.create_client(Trigger, f'/{name}/calibrator/refine'))
         heard.append(bench.listen(Imu, f'/{name}/imu/data_calibrated'))

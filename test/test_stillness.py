@@ -372,8 +372,7 @@ def test_a_sensor_that_lay_still_for_days_has_one_pose_per_orientation_unless_sp
     assert 'orientation' not in result.poses
     poses = capture(samples, G, CaptureSettings(max_dwell=3600)).poses
     assert 60 < len(poses) < 80
-    long = np.bincount(poses['orientation']).max()
-    assert long == pytest.approx(58, abs=1)
+    assert np.bincount(poses['orientation']).max() == pytest.approx(58, abs=1)
     assert np.ptp(poses['temperature']) > 1.0
     assert np.all(np.diff(poses['time']) > 0.0)
 

@@ -294,17 +294,12 @@ def test_figures_are_read_as_they_are_written(progress: Progress) -> None:
     assert Progress.from_figures(dict(seen.figures())) == seen
 
 
-@pytest.mark.parametrize(('name', 'text', 'words'), [
-    ('poses', None, 'no figure poses'), ('still', 'perhaps', 'still: perhaps'),
-    ('dwell [s]', 'long', 'dwell \\[s\\]: long')])
-def test_figures_of_another_version_are_refused(name: str, text: str | None, words: str) -> None:
-    figures = dict(START.figures())
-    if text is None:
-        del figures[name]
-    else:
-        figures[name] = text
-    with pytest.raises(InputError, match=f'{words}, expected .* install the same version'):
-        Progress.from_figures(figures)
+@pytest.mark.parametrize('changed', [
+    {'poses': None}, {'still': 'perhaps'}, {'dwell [s]': 'long'}])
+def test_figures_of_another_version_are_refused(changed: dict[str, str | None]) -> None:
+    figures = {**dict(START.figures()), **changed}
+    with pytest.raises(InputError, match=min(changed).partition(' ')[0]):
+        Progress.from_figures({name: text for name, text in figures.items() if text})
 
 
 def test_screen_shows_all_figures() -> None:

@@ -51,7 +51,7 @@ from numpy.typing import NDArray
 
 from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records
 from .levels import Known, Levels
-from .trend import oscillation, sliding, Stretch, stretch, windows_of
+from .trend import oscillation, sliding, Stretch, stretch
 from ..statistics import rms
 from ..table import Floats
 from ..units import Units
@@ -214,7 +214,12 @@ class Rule:
         if self._axes == 3 and np.isfinite(sums['first'][:, 3]).any():
             self._axes = 6
         axes, size = self._axes, len(judged)
-        means, level = windows_of(sums, axes, chunks.origin)
+        # Means and variances, (axes, m), of the windows; the sums are relative to the origin.
+        first, second = (np.ascontiguousarray(sums[name].T[:axes]) for name in ('first', 'second'))
+        inside, total, power = (sliding(np.add, each, CHUNKS_PER_WINDOW)
+                                for each in (sums['count'], first, second))
+        level = np.maximum(power - total * (total / inside), 0.0) / (inside - 1.0)
+        means = total / inside + chunks.origin[:axes, np.newaxis]
         mean, recent = means[:, -size:], level[:, -size:]
         seen = {length: stretch(sums, level, length, size, chunks.length)
                 for length in SLOPE_CHUNKS}

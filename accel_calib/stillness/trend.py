@@ -217,22 +217,6 @@ _DIGITS = 1e-14
 """Rounding error of differences of sums, relative to the squared reading."""
 
 
-def windows_of(sums: Records, axes: int, origin: Floats) -> tuple[Floats, Floats]:
-    """
-    Return means and variances, (axes, m), of the m windows of n chunks.
-
-    The sums are relative to the `origin` (6,), which is added to the means; `axes` is 3 for the
-    reading alone, or 6 with the rate.
-
-    """
-    first, second = (np.ascontiguousarray(sums[name].T[:axes]) for name in ('first', 'second'))
-    inside, total, power = (sliding(np.add, each, CHUNKS_PER_WINDOW)
-                            for each in (sums['count'], first, second))
-    mean = total / inside
-    power = np.maximum(power - total * mean, 0.0)
-    return mean + origin[:axes, np.newaxis], power / (inside - 1.0)
-
-
 @dataclass(frozen=True)
 class Stretch:
     """
