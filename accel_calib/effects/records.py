@@ -195,7 +195,7 @@ def _entry_of_curve(curve: EmpiricalCurve) -> Effect:
         terms = tuple(Term(k, axis, ZONAL + 3 * number + axis)
                       for k, number in enumerate(zones) for axis in range(3))
         return Effect(f'gain as a smooth function of {VARIABLES["direction"]}',
-                      'empirical curve', names, 'g/g', 0.001, plausible_g=0.5, terms=terms,
+                      'empirical curve', names, curve.unit, 0.001, plausible_g=0.5, terms=terms,
                       family='force')
     parts, of_force = curve.parts, variable == 'force'
     carried = [term._replace(parameter=parts.index(own)) for term in _CARRIED[curve.carrier]
@@ -208,7 +208,8 @@ def _entry_of_curve(curve: EmpiricalCurve) -> Effect:
     names = tuple(f'{own}_{mode}' for mode in modes for own in parts)
     words = (f'{curve.changed.replace("_", "-")} as a smooth function of '
              f'{variable_words(variable)}')
-    made = Effect(words, 'empirical curve', names, 'g', 0.001, plausible_g=0.5, terms=terms)
+    made = Effect(words, 'empirical curve', names, curve.unit, 0.001, plausible_g=0.5,
+                  terms=terms)
     if of_force:
         return replace(made, family='force')
     return replace(made, factor=partial(_cosines, variable, modes, len(carried)),
