@@ -153,7 +153,8 @@ def test_a_thermometer_with_steps_beside_a_ramp_does_not_hide_the_cause(seed, st
     stepped = poses.with_columns(temperature=step * np.round(temperature / step))
     found = ac.refine(stepped, base='10')
     only, = found.steps
-    assert found.verdict == 'explained' and 'offset_temperature' in (only.effect, *only.rivals)
+    assert found.verdict == 'explained'
+    assert 'offset_temperature' in (only.effect, *only.rivals)
     assert found.remaining_gap_mg < 0.35  # the noise is 0.3, the steps are as much or more
 
 
