@@ -264,16 +264,21 @@ class Sensor:
 
     def force_of(self, reading: Triple, known: Known) -> Triple | None:
         """Return the force of a reading by the `present` calibration [g]; None: not known."""
-        calibration = self.present
-        if calibration is None:
+        calibration, prepared = self.present, self._prepared
+        if calibration is None or prepared is None:
             return None
         context = {**calibration.model.neutral, 'std': _AT_REST, 'previous': _AT_REST,
                    'rate': _AT_REST, **self.temperatures.columns_of(calibration.model), **known}
-        prepared = OneReading(calibration, 1.0 / calibration.force_per_g)
         try:
             return prepared.at(context).correct(*reading)
         except InputError:
             return None  # a quantity is not known yet, or the reading is out of range
+
+    @cached_property
+    def _prepared(self) -> OneReading | None:
+        """Return what corrects one reading by the `present` calibration."""
+        return None if self.present is None else OneReading(
+            self.present, 1.0 / self.present.force_per_g)
 
 
 def new_sensor(settings: CalibratorSettings, units: Units) -> Sensor:
