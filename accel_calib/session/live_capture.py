@@ -259,11 +259,14 @@ class LiveCapture:
                 if not held.start <= time <= max(held.end, self._was_still) + away:
                     over.append(held)
             return Change(poses=True, doubted=self._doubt(over)) if over else None
-        dwell = self.detector.current()
-        if dwell is None:
+        ongoing = self.detector.ongoing()
+        if ongoing is None:
             return None
-        known = rest.end - rest.start if rest is not None and overlap(rest, dwell) else 0.0
-        if dwell.end - dwell.start < min(2.0 * known, known + LONG_REST):
+        known = 0.0 if rest is None or rest.end < ongoing.begin else rest.end - rest.start
+        if ongoing.end - ongoing.begin < min(2.0 * known, known + LONG_REST):
+            return None  # to judge a dwell costs more than to find its length
+        dwell = self.detector.current(ongoing)
+        if dwell is None:
             return None
         self._rest, captured = dwell, self._is_captured(dwell, capture)
         if captured:

@@ -99,9 +99,13 @@ class StillDetector:
         self.still = False
         return self._ended(found)
 
-    def current(self) -> Dwell | None:
-        """Return the ongoing dwell so far, or None if it is too short or not still."""
-        dwell = self._tracker.current()
+    def ongoing(self) -> OngoingDwell | None:
+        """Return the ongoing dwell as if it ended now, not yet judged; None: it is too short."""
+        return self._tracker.current()
+
+    def current(self, ongoing: OngoingDwell | None = None) -> Dwell | None:
+        """Return the `ongoing` dwell so far, or None if it is too short or not still."""
+        dwell = ongoing or self.ongoing()
         if dwell is None:
             return None
         now = figures(dwell, known_units=self.rule.known)
