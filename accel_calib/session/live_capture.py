@@ -51,7 +51,7 @@ LONG_REST = 300.0
 _LOOK_EVERY = 0.1
 """Interval at which an ongoing rest is checked [s]."""
 
-_PIECE = 0.35
+_PIECE = 0.6
 """Length, by the stamps, of the pieces into which a block of samples is divided [s]."""
 
 _NOISE_FELL = 0.9

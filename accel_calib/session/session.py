@@ -35,12 +35,12 @@ from ..logs import named_topics
 from ..table import Floats
 from ..text import counted
 
-BATCH = 0.3
+BATCH = 0.5
 """
 Interval at which messages are passed to a session [s].
 
 A batch takes several ms on a slow machine, and messages that arrive in this time wait. At 1 kHz
-and 3 batches per second, these are less than 1 % of the messages.
+and 2 batches per second, these are less than 1 % of the messages.
 
 """
 
