@@ -158,6 +158,21 @@ def test_a_thermometer_with_steps_beside_a_ramp_does_not_hide_the_cause(seed, st
     assert found.remaining_gap_mg < 0.35  # the noise is 0.3, the steps are as much or more
 
 
+def test_intervals_beside_a_thermometer_with_steps_contain_the_truth():
+    """The errors of neighbouring poses are alike: they do not average out."""
+    true, away = np.array([16e-3, -8e-3, 8e-3]), []
+    for seed in range(12):
+        share = np.sort(np.random.default_rng(seed).uniform(size=60))
+        temperature = 20.3 + 12.0 * share
+        poses = ac.simulate({**SENSOR, 'offset_temperature': true}, poses=60, seed=seed,
+                            time=3600.0 * share, temperature=temperature)
+        step, = ac.refine(poses.with_columns(temperature=np.round(temperature)), base='10').steps
+        if step.effect == 'offset_temperature':  # else a drift, which explains a ramp as well
+            away += [(step.parameters[axis] - each) / step.parameters_sd[axis]
+                     for axis, each in zip('xyz', true)]
+    assert np.mean(np.abs(away) < 1.96) > 0.9
+
+
 @pytest.mark.parametrize('other', ['humidity', 'temperature'])
 def test_a_product_of_two_columns_is_named_and_stored(other, tmp_path):
     rng = np.random.default_rng(8)
