@@ -25,8 +25,9 @@ import numpy as np
 from .calibration import (
     Calibration, check_sensor, Curve, curve_of, determines, directions_of, fit_partial, fit_poses,
     fit_with_fleet, flat_direction, FleetPrior, level, level_by_rows, lies_in_cone, lies_in_plane,
-    NORM_MODELS, PRIOR, SampleContext, thermal_alone, with_curve, without_curve)
-from .effects import Context, LADDER, Model, OwnEffect, PROCESSES
+    NORM_MODELS, Outside, outside, PRIOR, thermal_alone, with_curve, without_curve)
+from .effects import (
+    Context, context_of_samples, entry_of, LADDER, Model, OwnEffect, PROCESSES, thermal_stream)
 from .errors import InputError, RefusedFitError, saying
 from .finding import explained_by, Finding
 from .findings import outside_words, rate, Rating, USES_LIMIT
@@ -536,11 +537,25 @@ class Correction:
     def __init__(self, calibration: Calibration, units: Units | UnitName, sensor: str) -> None:
         check_sensor(calibration, sensor)
         self.calibration = calibration.in_units(units)
-        self._context = SampleContext(self.calibration)
+        self._thermal = thermal_stream(self.calibration.model)
+        self._compared: dict[str, Outside] = {}
+        self._lacking = ''
 
     def context(self, samples: Table) -> Context:
         """Return the context of the next block, as the effects need it."""
-        return self._context.of(samples.columns, len(samples))
+        model = self.calibration.model
+        found = context_of_samples(samples.columns, len(samples), model, self._thermal)
+        self._lacking = ''
+        if lacking := [key for key in model.neutral if key not in samples]:
+            names = [str(each) for each in model.effects if {*entry_of(each).needs} & {*lacking}]
+            self._lacking = (f'the samples have no {" and ".join(lacking)}: {" and ".join(names)} '
+                             f'{"is" if len(names) == 1 else "are"} not corrected')
+        for key, block in outside(self.calibration, found).items():
+            before = self._compared.get(key, block)
+            self._compared[key] = block if before is block else replace(
+                block, count=before.count + block.count, samples=before.samples + block.samples,
+                least=min(before.least, block.least), most=max(before.most, block.most))
+        return found
 
     def __call__(self, samples: _Samples) -> _Samples:
         """Return the next block with corrected readings, in m/s² or g, in the levelled frame."""
@@ -556,6 +571,7 @@ class Correction:
     @property
     def notes(self) -> list[str]:
         """Return what the samples lack, and what left the range of the calibration, so far."""
-        return [*filter(None, [self._context.lacking]), *(
+        return [*filter(None, [self._lacking]), *(
             f'{each.count} of {counted(each.samples, "sample")} are outside of the range of the '
-            f'calibration: {outside_words(each)}; {USES_LIMIT}' for each in self._context.left)]
+            f'calibration: {outside_words(each)}; {USES_LIMIT}'
+            for each in self._compared.values() if each.count)]

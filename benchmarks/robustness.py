@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from accel_calib.calibration import Calibration, fit_poses
-from accel_calib.effects.simulate import path
+from accel_calib.effects.history import path
 from accel_calib.errors import AccelCalibError
 from accel_calib.statistics import rms
 from accel_calib.stillness import capture
