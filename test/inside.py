@@ -70,15 +70,16 @@ from accel_calib.pipeline import (
     RampIntake, thermally_calibrated)
 from accel_calib.refinement import base as refine_base
 from accel_calib.refinement.base import clipped, grid_step, off_grid, sampled, unclipped
-from accel_calib.refinement.beam import accepted, explored, reshaped
 from accel_calib.refinement.curves import (
-    _grown as grown_curve, _rss_beside as rss_beside, best_curve, FoundCurve, Near, probabilities,
-    Process, process_of, SIGNIFICANT, Walk, walk_beside)
+    _grown as grown_curve, _rss_beside as rss_beside, best_curve, FoundCurve, Process, process_of,
+    SIGNIFICANT, Walk, walk_beside)
 from accel_calib.refinement.linear import (
-    _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, Set, with_outliers)
+    _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, Set, with_outliers)
 from accel_calib.refinement.search import (
     _is_better as is_better_than_walk, _less as less, search as search_effects)
-from accel_calib.refinement.state import beginning, candidates, fitted_state, linearised, WORTH
+from accel_calib.refinement.settle import accepted, explored, Near, probabilities, reshaped
+from accel_calib.refinement.state import (
+    beginning, candidates, fitted_state, linearised, outside_of, WORTH)
 from accel_calib.refinement.steps import remarks_on
 from accel_calib.report.page import all_drawings, axis_figures, curve_parts
 from accel_calib.report.residuals import residuals_of

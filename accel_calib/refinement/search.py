@@ -6,8 +6,8 @@ The search for missing effects.
 
 1. The effects of the ladder (offset, gain, gain by axis, cross-axis) that the base lacks are
    added.
-2. A beam search (`.beam`) finds the set of effects, outliers and a random walk of the offset with
-   the best score, in the equations near the model.
+2. A beam search (`.settle`) finds the set of effects, outliers and a random walk of the offset
+   with the best score, in the equations near the model.
 3. All values are fitted again, without the outliers, and the equations are set up near the new
    model. Steps 2 and 3 are repeated until the set remains the same, and again with products of two
    columns if a gap or a walk remains.
@@ -38,9 +38,9 @@ import scipy
 
 from .base import causes, Clipped, off_grid, unclipped
 from .curves import (
-    best_curve, CLEARLY, FoundCurve, Near, one_curve, process_of, SIGNIFICANT, Walk, walk_beside)
+    best_curve, CLEARLY, FoundCurve, one_curve, process_of, SIGNIFICANT, Walk, walk_beside)
 from .linear import LEVEL, Set
-from .settle import fit_without, make_sound, settle
+from .settle import fit_without, make_sound, Near, settle
 from .state import beginning, Candidate, fitted_state, linearised, State, without
 from ..effects import (
     CHANGES, Covariate, COVARIATES, EffectKey, EFFECTS, entry_of, factors_of, included, LADDER,
@@ -82,13 +82,13 @@ class Found:
     The result of a search.
 
     `base` and `final` are the states before and after it, with the same poses. `outliers` (d,) are
-    the indices of the outliers. `near` has the equations near the final model; `walk` is beside it
-    at the poses kept. `added` are the added effects, in order, with `WANDER` last if the rest is a
-    random walk of the offset; they are listed at the end of a search. `taken_back` are effects
-    that were removed because they explain too little, or no more than by chance. Poses at the
-    limit of the sensor are left out: they are `clipped`, and `with_clipped` is the base fitted to
-    all poses. `grid_g` is the step of the grid of the readings [g], if it is relevant. `also`
-    are the own effects that were asked for.
+    the indices of the outliers. `near` has the equations near the final model. `added` are the
+    added effects, in order, with `WANDER` last if the rest is a random walk of the offset; they
+    are listed at the end of a search. `taken_back` are effects that were removed because they
+    explain too little, or no more than by chance. Poses at the limit of the sensor are left out:
+    they are `clipped`, and `with_clipped` is the base fitted to all poses. `grid_g` is the step of
+    the grid of the readings [g], if it is relevant. `also` are the own effects that were asked
+    for.
 
     """
 
@@ -96,7 +96,6 @@ class Found:
     final: State
     outliers: NDArray[np.intp]
     near: Near
-    walk: Walk | None = None
     curve: FoundCurve | None = None
     added: tuple[EffectKey, ...] = ()
     taken_back: tuple[EffectKey, ...] = ()
@@ -104,6 +103,20 @@ class Found:
     grid_g: float | None = None
     with_clipped: State | None = None
     also: tuple[OwnEffect, ...] = ()
+
+    @cached_property
+    def walk(self) -> Walk | None:
+        """Return the walk beside the final model, at the poses kept."""
+        linear = self.final.linear
+        process = process_of(linear, self.final.poses_g) if self.near.walk is not None else None
+        return None if process is None else walk_beside(Set.of(linear), process)
+
+    @cached_property
+    def left(self) -> tuple[Floats, Floats]:
+        """Return the final residual without the walk, and the same held out."""
+        if self.walk is None:
+            return self.final.residual, self.final.held_out
+        return self.walk.residuals(Set.of(self.final.linear), self.final.fit.equations.force)
 
     @cached_property
     def one_curve(self) -> tuple[str, ...]:
@@ -125,10 +138,9 @@ def search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...] = ()) -> Fou
         poses_g = poses_g.take(everyone)
     poses_g, grid = off_grid(poses_g, base)
     found = _search(poses_g, base, also)
-    for again in (_with_own_noise, _with_scatter):
-        found = again(found, poses_g, base, also)
-    base_state, final = _weighted(found.base), _weighted(found.final)
-    return replace(found, base=base_state, final=final, walk=_walk(final, found.near),
+    again = _with_own_noise if 'new' in poses_g else _with_scatter
+    found = again(found, poses_g, base, also)
+    return replace(found, base=_weighted(found.base), final=_weighted(found.final),
                    outliers=everyone[found.outliers], clipped=clip, grid_g=grid,
                    with_clipped=whole, also=also)
 
@@ -143,8 +155,7 @@ def _with_own_noise(found: Found, poses_g: Poses, base: Model, also: tuple[OwnEf
 
     """
     near, noise = found.near, poses_g.noise
-    if noise is None or 'new' not in poses_g or not near.plain.worth or not (
-            found.walk or found.curve):
+    if noise is None or not near.plain.worth or not (found.walk or found.curve):
         return found
     onto, residual = near.beside.spanned
     own = 1.0 - np.sum(near.plain.onto ** 2, axis=1) - np.sum(onto ** 2, axis=1)
@@ -165,7 +176,7 @@ def _with_scatter(found: Found, poses_g: Poses, base: Model, also: tuple[OwnEffe
     If their noise differs, the quiet ones have too much weight, and effects fit their scatter.
 
     """
-    if not found.added or 'new' in poses_g:
+    if not found.added:
         return found
     scatter, largest = scatter_of(found.base.fit), np.inf
     near = found.near
@@ -194,8 +205,7 @@ def _weighted(state: State) -> State:
 def _beside(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
     """Search in poses with a scatter, and state the result without it."""
     found = _search(poses_g, base, also)
-    first, final = (State(stated(state.fit)) for state in (found.base, found.final))
-    return replace(found, base=first, final=final, walk=_walk(final, found.near))
+    return replace(found, base=State(stated(found.base.fit)), final=State(stated(found.final.fit)))
 
 
 def _search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
@@ -231,8 +241,7 @@ def _search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
         near = replace(near, chosen=near.chosen.instead(()))
     out = near.chosen.out
     first = fit_without(start, poses_g, out) if out else start
-    found = Found(first, state, np.array(out, np.intp), near, _walk(state, near),
-                  taken_back=taken_back)
+    found = Found(first, state, np.array(out, np.intp), near, taken_back=taken_back)
     chance = tuple(name for name in near.names if _is_coincidence(found, name))
     fewer = _less(found, chance)
     found = found if fewer is None else replace(fewer, taken_back=chance)
@@ -241,7 +250,7 @@ def _search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
     there = {*state.model.values, *included(state.model.values), WANDER} - _of_a_turn(state)
     beyond = (*ladder, *near.names, *(() if found.curve is None else (found.curve.name,)),
               *(() if near.walk is None else (WANDER,)))
-    return replace(found, final=state, near=near, walk=_walk(state, near),
+    return replace(found, final=state, near=near,
                    added=tuple(name for name in beyond if name in there))
 
 
@@ -331,7 +340,7 @@ def _with_curve(found: Found, curve: FoundCurve, start: State, poses_g: Poses) -
         return None
     near = replace(found.near, walk=None, chosen=found.near.beside)
     return replace(found, base=fit_without(start, poses_g, curve.out), final=after, near=near,
-                   walk=None, curve=curve, outliers=np.array(curve.out, np.intp))
+                   curve=curve, outliers=np.array(curve.out, np.intp))
 
 
 def _less(found: Found, names: Collection[EffectKey]) -> Found | None:
@@ -341,15 +350,11 @@ def _less(found: Found, names: Collection[EffectKey]) -> Found | None:
     None if there are no such effects, or if the fit without them fails.
 
     """
-    values = {name: part for name, part in found.final.model.values.items() if name not in names}
-    state = fitted_state(Model(values), found.final.poses_g) if names else None
+    state = found.final.refit_without(names) if names else None
     if state is None:
         return None
-    chosen = found.near.beside
-    blocks = [block for block, name in zip(chosen.blocks, chosen.effects, strict=True)
-              if name not in names]
-    near = replace(found.near, walk=None, chosen=chosen.instead(blocks))
-    fewer = replace(found, final=state, near=near, walk=None)
+    near = replace(found.near, walk=None, chosen=found.near.beside.without_effects(names))
+    fewer = replace(found, final=state, near=near)
     return fewer if found.walk is None else _walking(fewer) or fewer
 
 
@@ -362,7 +367,7 @@ def _walking(found: Found) -> Found | None:
     if walk is None or walk.likelihood_ratio < SIGNIFICANT:
         return None
     near = replace(near, walk=walk, chosen=near.chosen.within(walk.whitened(near.plain)))
-    return replace(found, near=near, walk=_walk(found.final, near))
+    return replace(found, near=near)
 
 
 def _is_better(curve: FoundCurve, near: Near) -> bool:
@@ -406,8 +411,3 @@ def _of_a_turn(state: State) -> set[EffectKey]:
                            for name in gains])
     chi2 = away @ np.linalg.solve(state.fit.covariance[np.ix_(index, index)], away)
     return set(gains) if chi2 < scipy.special.chdtri(len(away), LEVEL) else set()
-
-
-def _walk(state: State, near: Near) -> Walk | None:
-    process = None if near.walk is None else process_of(state.linear, state.poses_g)
-    return None if process is None else walk_beside(Set.of(state.linear), process)

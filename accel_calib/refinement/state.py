@@ -12,7 +12,7 @@ out of the equations, for the candidates that the context of the poses allows.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 import math
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 import scipy
 
-from .linear import Block, LEAST_OWN, Linear, orthonormal, outside_of
+from .linear import Block, LEAST_OWN, Linear
 from ..calibration import determines, NORM_MODELS
 from ..effects import (
     add_history, Context, Effect, EffectKey, entry_of, factors_of, included, kind_of, linear_model,
@@ -143,22 +143,48 @@ def linearised(fit: Fit, base: tuple[EffectKey, ...], tried: Iterable[Candidate]
     if further.values:
         residual = residual + near.columns(further) @ amplitudes_of(further)
     onto = orthonormal(np.hstack([near.columns(held)[:, held.fitted], near.columns(beside)]))
-    tried = [each.beside(further.values.get(each.effect), fit.context) for each in tried]
-    alike = Counter(kind_of(each.effect) for each in tried)
+    context = fit.context
+    tried = [each.beside(further.values.get(each.effect), context) for each in tried]
+    kinds_tried = [kind_of(each.effect) for each in tried]
+    alike = Counter(kinds_tried)
     widths = [len(each.shapes) * len(each.entry.parameters) for each in tried]
     every, sizes = np.empty((sum(widths) + 1, len(near.pose))), np.empty(sum(widths))
     every[-1] = residual - onto @ (onto.T @ residual)
     blocks: list[Block] = []
-    for each, start, width in zip(tried, np.cumsum([0, *widths]).tolist(), widths):
+    for each, kind, start, width in zip(
+            tried, kinds_tried, np.cumsum([0, *widths]).tolist(), widths):
         own = slice(start, start + width)
         columns, sizes[own] = outside_of(onto, near.columns_of(each.effect, each.factors))
         every[own] = columns.T
-        blocks += each.blocks(start, alike[kind_of(each.effect)])
+        blocks += each.blocks(start, alike[kind])
     return Linear(
         onto=onto, pose=near.pose, blocks=tuple(blocks), every=every, sizes=sizes,
         worth=WORTH if near.noise_known else 0.0, dof=near.count - onto.shape[1],
         base_rss=float(every[-1] @ every[-1]), choice=2.0 * math.log(1.0 + len(alike)),
         offset=near.columns(Model({'offset': np.zeros(3)})))
+
+
+def outside_of(onto: Floats, columns: Floats) -> tuple[Floats, Floats]:
+    """Return (m, c) columns of norm 1 with a base projected out, and their (c,) norms before."""
+    sizes = _norms(columns)
+    rows = columns.T / sizes[:, np.newaxis]
+    rows -= (rows @ onto) @ onto.T
+    return rows.T, np.where(sizes < np.inf, sizes, 1.0)
+
+
+def orthonormal(columns: Floats) -> Floats:
+    """Return orthonormal columns with the span of others."""
+    if not columns.shape[1]:
+        return columns
+    vectors, scales, _ = np.linalg.svd(columns / _norms(columns), full_matrices=False)
+    return np.asarray(vectors[:, scales > 1e-6 * scales[0]])
+
+
+def _norms(columns: Floats) -> Floats:
+    """Return the norms of columns, infinite for a column of zeros, which remains one."""
+    sizes: Floats = np.sqrt(np.einsum('mc,mc->c', columns, columns))
+    sizes[sizes < 1e-100] = np.inf  # products of smaller numbers underflow
+    return sizes
 
 
 def left_open(state: State) -> Model:
@@ -230,6 +256,11 @@ class State:
     def is_noise(self) -> bool:
         """Return whether noise may explain the residual; True if the noise is not known."""
         return not self.fit.noise_known or is_noise(self.rss, self.dof)
+
+    def refit_without(self, effects: Collection[EffectKey]) -> State | None:
+        """Return the fit to the same poses without some effects; None without a sound fit."""
+        return fitted_state(Model({name: values for name, values in self.model.values.items()
+                                   if name not in effects}), self.poses_g)
 
     def gap_mg(self, residual: Floats) -> float:
         """Return the RMS over the new poses of (m,) residuals of the equations [mg]."""
