@@ -63,8 +63,9 @@ from accel_calib.logs.names import format_named, meaning, NAMES as LOG_FORMATS
 from accel_calib.logs.quantities import are_samples
 from accel_calib.logs.serialized import frame_ids, stamps_of
 from accel_calib.messages.one_reading import OneReading
-from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS, fit_components
-from accel_calib.noise.curve import allan_variances, longest_rest, octaves, shares, spread_of
+from accel_calib.noise.allan import (
+    allan_variances, COMPONENTS as ALLAN_COMPONENTS, fit_components, octaves, shares, spread_of)
+from accel_calib.noise.figures import longest_rest
 from accel_calib.pipeline import (
     calibrated as calibrated_by, Correction, Intake, is_partial, Plan as FitPlan, poses_of,
     RampIntake, thermally_calibrated)
