@@ -37,7 +37,6 @@ from typing import cast, NamedTuple
 
 import numpy as np
 
-from .base import causes
 from .linear import Block, LEAST_OWN, LEVEL, Linear, Set, with_outliers
 from .state import candidates, left_open, linearised, outside_of, State
 from ..effects import (
@@ -65,6 +64,13 @@ _PROPORTION = 2.0
 
 _TURNS = np.linspace(0.0, np.pi, 1801)
 """Angles at which a proportion of two effects is looked for; the middle one is a right angle."""
+
+_EQUAL = 1e-9
+"""Relative difference below which numbers of a quantity are equal."""
+
+_OF_READING = 0.1
+"""Scatter of the ratio of a quantity to the length of the readings below which it is computed from
+them, relative to the scatter of the length."""
 
 
 class FoundCurve(NamedTuple):
@@ -97,6 +103,23 @@ class _Family(NamedTuple):
         parts = self.curve.parts
         alone = [(part, slice(k, None, len(parts))) for k, part in enumerate(parts)]
         return [('', slice(None)), *(alone if len(parts) > 1 else ())]
+
+
+def causes(poses_g: Poses) -> tuple[str, ...]:
+    """Return the quantities that vary, other than row numbers and lengths of the readings."""
+    length, found = np.linalg.norm(poses_g.reading, axis=1), []
+    for key in poses_g.quantities:
+        values = poses_g[key]
+        known = values[np.isfinite(values)]
+        if not len(known) or np.ptp(known) <= _EQUAL * np.max(np.abs(known)):
+            continue
+        steps, ratio = np.diff(values), values / length
+        counts_rows = np.all(np.abs(steps - steps[:1]) <= _EQUAL * np.abs(steps[:1]))
+        is_length = (np.std(ratio) * np.mean(length)
+                     < _OF_READING * np.std(length) * np.abs(np.mean(ratio)))
+        if not counts_rows and not is_length:
+            found.append(key)
+    return tuple(found)
 
 
 def best_curve(state: State, poses_g: Poses, out: tuple[int, ...], *, least: float = CLEARLY,

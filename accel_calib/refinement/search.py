@@ -23,6 +23,13 @@ The search for missing effects.
 
 A set is kept only if its fit converged, the cost decreased and its values are plausible.
 
+**Long tables.** A sample of a long table bounds the time and the memory of a refinement; such
+tables come from machines, or are samples in place of poses. With `MOST` equations a refinement
+takes 10 s and 300 MB as a rule, and about a minute and 900 MB in the worst case: all context, and
+noise that no effect explains. A pose has one equation, or three if its orientation is known or
+shared. The sample takes one pose out of each part of the table. The place in the part changes by
+the golden ratio, so that a table that repeats the same turns gives all of them.
+
 """
 
 from __future__ import annotations
@@ -36,17 +43,22 @@ import numpy as np
 from numpy.typing import NDArray
 import scipy
 
-from .base import causes, Clipped, off_grid, unclipped
 from .curves import (
-    best_curve, CLEARLY, FoundCurve, one_curve, process_of, SIGNIFICANT, Walk, walk_beside)
+    best_curve, causes, CLEARLY, FoundCurve, one_curve, process_of, SIGNIFICANT, Walk, walk_beside)
 from .linear import LEVEL, Set
 from .settle import fit_without, make_sound, Near, settle
-from .state import beginning, Candidate, fitted_state, linearised, State, without
+from .state import (
+    beginning, Candidate, Clipped, fitted_state, linearised, off_grid, State, unclipped, without)
 from ..effects import (
     CHANGES, Covariate, COVARIATES, EffectKey, EFFECTS, entry_of, factors_of, included, LADDER,
-    linear_values, Model, OwnEffect, parameter_names, WANDER)
+    linear_values, Model, OwnEffect, parameter_names, unchanged, WANDER, with_vector)
 from ..estimate import beside_scatter, kinds, scatter_of, stated
 from ..table import CONTEXT, Floats, Poses
+
+MOST = 6000
+"""Largest number of equations that a refinement uses."""
+
+_GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 _TIMED = 30.0
 """A curve over time must have a score better than a walk by this."""
@@ -74,6 +86,34 @@ _LEAST_SHARE = 0.6
 _HELD_OUT = 0.7
 """Part of the squares above the noise that a curve must explain in poses held out. Chance also
 finds a curve over some quantity for an offset that wanders, which explains less."""
+
+
+def sampled(poses: Poses) -> Poses:
+    """Return the poses for `MOST` equations, and as many of those of a stored calibration."""
+    most = MOST // (3 if {'reference', 'orientation'} & set(poses.columns) else 1)
+    if len(poses) <= most:
+        return poses
+    new = poses['new'] > 0.0 if 'new' in poses else np.ones(len(poses), bool)
+    parts = []
+    for part in (np.flatnonzero(new), np.flatnonzero(~new)):
+        count = len(part)
+        kept = _spread(count, most)
+        if 'orientation' in poses and count > most:
+            group = np.unique(poses['orientation'][part], return_inverse=True)[1]
+            groups = int(group.max()) + 1
+            whole = np.flatnonzero(np.isin(group, _spread(groups, max(most * groups // count, 1))))
+            if most // 2 <= len(whole) <= 2 * most:
+                kept = whole  # all poses of some orientations
+        parts.append(part[kept])
+    return poses.take(np.sort(np.concatenate(parts)))
+
+
+def _spread(count: int, wanted: int) -> NDArray[np.intp]:
+    """Return at most `wanted` different indices, one out of each part of the range."""
+    if count <= wanted:
+        return np.arange(count)
+    part = np.arange(wanted)
+    return np.unique(((part + part * _GOLDEN % 1.0) * (count / wanted)).astype(np.intp))
 
 
 @dataclass(frozen=True)
@@ -277,7 +317,8 @@ def _is_coincidence(found: Found, name: EffectKey) -> bool:
     factors = moved[~alike][:, :, np.argsort(order)]  # (s, t or 1, n)
     if len(factors) < 2:
         return False
-    shifted = Candidate(name, (shape,) * len(factors), tuple(range(len(factors))), 1.0, factors)
+    shifted = Candidate(name, entry, (shape,) * len(factors), tuple(range(len(factors))),
+                        tried=1.0, factors=factors)
     linear = linearised(state.fit, tuple(each for each in values if each != name), (shifted,))
     *others, own = Set.of(linear).gains()[0]
     return bool(max(others) > own)
@@ -411,3 +452,30 @@ def _of_a_turn(state: State) -> set[EffectKey]:
                            for name in gains])
     chi2 = away @ np.linalg.solve(state.fit.covariance[np.ix_(index, index)], away)
     return set(gains) if chi2 < scipy.special.chdtri(len(away), LEVEL) else set()
+
+
+def with_changes(model: Model) -> tuple[Model, Floats]:
+    """
+    Return a model with the changes since the stored calibration included in its effects.
+
+    The (q, p) matrix maps the values of `model` to those of the result.
+
+    """
+    effects: list[EffectKey] = []
+    for name in sorted(model.effects, key=CHANGES.__contains__):  # the changes last
+        own = unchanged(name)
+        contained = included((own,)).intersection(effects)
+        if contained:
+            effects[effects.index(contained.pop())] = own
+        elif own not in effects and own not in included(effects):
+            effects.append(own)
+    names = parameter_names(tuple(effects))
+    owners: list[tuple[str, ...]] = []
+    for own in map(unchanged, model.effects):  # of each value, those of the result it adds to
+        whole = tuple(effect for effect in effects if own in included((effect,)))
+        owners += [(value,) if own in effects else parameter_names(whole)
+                   for value in parameter_names((own,))]
+    matrix = np.array([[name in owner for owner in owners] for name in names], float)
+    matrix = matrix.reshape(len(names), len(owners))
+    values = with_vector(tuple(effects), matrix @ model.vector).values
+    return Model(values, model.rotation), matrix
