@@ -237,7 +237,7 @@ def _accepted(score: float, chosen: Set, tried: int) -> FoundCurve | None:
     blocks, first = sorted(chosen.blocks), chosen.entries[0]
     waves = [cast(EmpiricalCurve, chosen.linear.blocks[block].effect) for block in blocks]
     curve = replace(waves[0], modes=tuple(wave.modes[0] for wave in waves))
-    values = np.concatenate([*(chosen.values[block] for block in blocks), first.shape])
+    values = np.concatenate([*(chosen.parts[block] for block in blocks), first.shape])
     explained = 1.0 - _held_out(chosen) / max(_held_out(nothing), 1e-300)
     return FoundCurve(name=curve, values=values, score=score, out=chosen.out, p_value=p_value,
                       explained=explained)

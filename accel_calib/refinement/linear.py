@@ -308,6 +308,11 @@ class Set:
     def without(self, block: int) -> Set:
         return self.instead(other for other in self.blocks if other != block)
 
+    @property
+    def smaller(self) -> list[Set]:
+        """Return a set of several effects without each of them."""
+        return [self.without(block) for block in self.blocks if len(self.blocks) > 1]
+
     def without_effects(self, effects: Collection[EffectKey]) -> Set:
         return self.instead(block for block in self.blocks
                             if self.linear.blocks[block].effect not in effects)
@@ -333,7 +338,7 @@ class Set:
         """Return the penalty for effects that are far larger than in common sensors."""
         if not self.blocks:
             return 0.0
-        largest = np.array([np.max(np.abs(values)) for values in self._parts])
+        largest = np.array([np.max(np.abs(part)) for part in self.parts.values()])
         typical = [each.entry.typical for each in self.entries]
         away = np.log(np.maximum(largest / typical, 1.0)) / _USUAL
         return float(np.sum(np.minimum(away ** 2, _MOST_UNUSUAL)))
@@ -352,16 +357,17 @@ class Set:
         return tuple(each.effect for each in self.entries)
 
     @cached_property
-    def values(self) -> dict[int, Floats]:
-        """Return the (p,) values of the effect of each block."""
-        return dict(zip(self.blocks, self._parts, strict=True))
-
-    @cached_property
-    def _parts(self) -> Sequence[Floats]:
-        """Return the values of the effect of each block, in the order of the blocks."""
+    def parts(self) -> dict[int, Floats]:
+        """Return the (p,) values of the columns of each block."""
         values = self.mix[len(self.root):] @ self.across[:, -1] / self.linear.sizes[self._index]
         ends = accumulate(each.columns.stop - each.columns.start for each in self.entries)
-        return np.split(values, list(ends))[:-1]
+        return dict(zip(self.blocks, np.split(values, list(ends))))
+
+    @property
+    def values(self) -> dict[EffectKey, Floats]:
+        """Return the values of each effect, which end with those of its shape."""
+        return {each.effect: np.concatenate([part, each.shape])
+                for each, part in zip(self.entries, self.parts.values(), strict=True)}
 
     @property
     def _index(self) -> list[int]:

@@ -256,15 +256,15 @@ def _search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
     ladder = near.names
     fixed = (*base.effects, *ladder)
     fixed = tuple(name for name in fixed if name not in included(fixed))
-    present = {*map(str, fixed)}
+    quantities = causes(poses_g)
     names: tuple[EffectKey, ...] = (
         *_visible(begun, LADDER), *(name for name in EFFECTS if name not in LADDER),
-        *(own for own in also if own.name not in present),
-        *(Covariate(part, (quantity,), power) for quantity in causes(poses_g)
+        *(own for own in also if own.name not in {*map(str, fixed)}),
+        *(Covariate(part, (quantity,), power) for quantity in quantities
           for part in COVARIATES for power in (1, 2)),
         *_visible(begun, CHANGES))
     state, near, trial = settle(begun, poses_g, fixed, names)
-    varied = {*causes(poses_g), *(column for column in CONTEXT if column in poses_g)}
+    varied = {*quantities, *(column for column in CONTEXT if column in poses_g)}
     if len(varied) <= _MOST_VARIED and (near.walk is not None or not state.is_noise):
         products: tuple[EffectKey, ...] = tuple(
             Covariate(part, pair) for pair in combinations(sorted(varied), 2)
@@ -282,16 +282,20 @@ def _search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
     out = near.chosen.out
     first = fit_without(start, poses_g, out) if out else start
     found = Found(first, state, np.array(out, np.intp), near, taken_back=taken_back)
-    chance = tuple(name for name in near.names if _is_coincidence(found, name))
-    fewer = _less(found, chance)
-    found = found if fewer is None else replace(fewer, taken_back=chance)
-    found = _described(found, start, poses_g)
+    found = _described(_without_chance(found), start, poses_g)
     state, near = make_sound(found.final, found.near, trial, found.base.model, ladder)
     there = {*state.model.values, *included(state.model.values), WANDER} - _of_a_turn(state)
     beyond = (*ladder, *near.names, *(() if found.curve is None else (found.curve.name,)),
               *(() if near.walk is None else (WANDER,)))
     return replace(found, final=state, near=near,
                    added=tuple(name for name in beyond if name in there))
+
+
+def _without_chance(found: Found) -> Found:
+    """Return what was found, without the effects that are a coincidence."""
+    chance = tuple(name for name in found.near.names if _is_coincidence(found, name))
+    fewer = _less(found, chance)
+    return found if fewer is None else replace(fewer, taken_back=chance)
 
 
 def _is_coincidence(found: Found, name: EffectKey) -> bool:

@@ -102,17 +102,12 @@ def explored(linear: Linear) -> list[Set]:
             front = best_of_each(with_outliers(tested))[:_WIDTH]
             if not front:
                 break
-            visited += [*front, *(fewer for new in front[:3] for fewer in _fewer(new))]
+            visited += [*front, *(fewer for new in front[:3] for fewer in new.smaller)]
             idle = 0 if front[0].score > best else idle + 1
             best = max(best, front[0].score)
             if idle == _PATIENCE:
                 break
     return best_of_each(visited)
-
-
-def _fewer(chosen: Set) -> list[Set]:
-    """Return a set of several effects without each of them."""
-    return [chosen.without(block) for block in chosen.blocks if len(chosen.blocks) > 1]
 
 
 def reshaped(chosen: Set) -> list[Set]:
@@ -129,7 +124,7 @@ def reshaped(chosen: Set) -> list[Set]:
         if block.searched and fitted_places(block.entry, block.shape):
             fitted.setdefault(block.effect, []).append(number)
     sets = []
-    for less in _fewer(chosen):
+    for less in chosen.smaller:
         for effect, own in fitted.items():
             others = less.without_effects((effect,))
             if is_barred(blocks[own[0]], others.entries):
@@ -305,9 +300,8 @@ class Trial:
     def fitted(self, chosen: Set, state: State, most: float = np.inf) -> State | None:
         """Return the fit of a set; None without a sound fit below `most`."""
         model = {name: part for name, part in state.model.values.items() if name in self.fixed}
-        for number, values in chosen.values.items():
-            block = chosen.linear.blocks[number]
-            model = with_effect(model, block.effect, np.concatenate([values, block.shape]))
+        for effect, values in chosen.values.items():
+            model = with_effect(model, effect, values)
         after = fitted_state(Model(model), without(self.poses_g, chosen.out), most)
         if after is None or not chosen.blocks:
             return after

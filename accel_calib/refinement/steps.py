@@ -453,10 +453,9 @@ def _constants_at_bounds(own: OwnEffect, found: Found) -> dict[str, float]:
     if before is None or not tried or not effect.bounds:
         return {}
     alone = Set.of(linearised(before.fit, before.model.effects, tried))
-    grown = alone.extended(best := alone.best_of(own))
+    grown = alone.extended(alone.best_of(own))
     after = None if grown.score <= 0.0 else fitted_state(Model(with_effect(
-        before.model.values, own, np.concatenate(
-            [grown.values[best], alone.linear.blocks[best].shape]))), final.poses_g)
+        before.model.values, own, grown.values[own])), final.poses_g)
     shape = () if after is None else effect.split(after.model.values[own])[1].tolist()
     return {constant: value for constant, value, bounds in zip(
         effect.shape, shape, effect.bounds) if value in bounds}
@@ -478,9 +477,8 @@ def find_rivals(found: Found) -> list[dict[EffectKey, tuple[float, Fit]]]:
         for rival, weight in weights.items():
             if rival == WANDER or shown_name(rival) == shown_name(name) or weight <= LEAST:
                 continue
-            best = others.best_of(rival)
-            values = [others.extended(best).values[best], others.linear.blocks[best].shape]
-            model = Model(with_effect(kept, rival, np.concatenate(values)))
+            beside = others.extended(others.best_of(rival))
+            model = Model(with_effect(kept, rival, beside.values[rival]))
             state = fitted_state(model, final.poses_g)
             if state is not None:
                 fits[rival] = state.fit

@@ -239,11 +239,11 @@ class Dwell:
         return Rest(self.start, self.end, self.reason)
 
 
-def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -> list[Dwell]:
+def judged(table: Records, rule: Rule, context: Sequence[str]) -> list[Dwell]:
     """
-    Return each dwell from `first` on, with the reason why it is no pose with the noise known now.
+    Return the dwells of a table of `figures`, with the reason why one is no pose, if so.
 
-    All dwells of the table of `figures` are used. `context` names its columns of context.
+    They are tested with the noise known now. `context` names the columns of context.
 
     """
     means, std = table['mean'][:, :3], table['std']
@@ -263,8 +263,8 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -
     count = np.sum(rounded**2, axis=0) / np.sum(variance, axis=0)
     rate_std = np.maximum(np.sqrt(table['average'][:, 3:]), rate_step / math.sqrt(12.0))
     found = []
-    for each, own, n, own_rate, why, at_limit in zip(*(part[first:] for part in (
-            table, rounded.T.copy(), count, rate_std, reason, ends)), strict=True):
+    for each, own, n, own_rate, why, at_limit in zip(
+            table, rounded.T.copy(), count, rate_std, reason, ends, strict=True):
         around: dict[str, float | Floats] = {
             name: value for name, value in zip(context, each['around'].tolist(), strict=True)
             if math.isfinite(value)}

@@ -57,7 +57,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records
-from .trend import oscillation, sliding, Stretch, stretch
+from .trend import oscillation, sliding, Stretch, stretch, window_figures
 from ..statistics import rms
 from ..table import Floats
 from ..units import Units
@@ -297,12 +297,7 @@ class Rule:
         if self._axes == 3 and np.isfinite(sums['first'][:, 3]).any():
             self._axes = 6
         axes, size = self._axes, len(judged)
-        # Means and variances, (axes, m), of the windows; the sums are relative to the origin.
-        first, second = (np.ascontiguousarray(sums[name].T[:axes]) for name in ('first', 'second'))
-        inside, total, power = (sliding(np.add, each, CHUNKS_PER_WINDOW)
-                                for each in (sums['count'], first, second))
-        level = np.maximum(power - total * (total / inside), 0.0) / (inside - 1.0)
-        means = total / inside + chunks.origin[:axes, np.newaxis]
+        means, level = window_figures(sums, chunks.origin[:axes])
         mean, recent = means[:, -size:], level[:, -size:]
         seen = {length: stretch(sums, level, length, size, chunks.length)
                 for length in SLOPE_CHUNKS}
@@ -315,30 +310,32 @@ class Rule:
         noise, varied = self._learn(seen[LONG], mean, judged['step'].T, *(
             sliding(np.maximum, each, LONG - CHUNKS_PER_WINDOW + 1)[..., -size:] > 0.0
             for each in gaps))
-        missing = np.where(zero[-size:] > 0.0, 1, np.where((equal[-size:] > 0.0) & varied, 2, 0))
         quiet = np.all(QUIETER * recent[:3] < self._given.least[:3, np.newaxis], axis=0)
-        missing[quiet & (missing == 0) & (equal[-size:] == 0.0)] = 3
+        missing = np.select([zero[-size:] > 0.0, (equal[-size:] > 0.0) & varied,
+                             (equal[-size:] == 0.0) & quiet], [1, 2, 3])
         measured = missing == 0
         self.quietest = float(np.fmin.reduce(
             recent[:3].max(axis=0)[measured], initial=self.quietest))
         scale = np.asarray(self._per_g)
         if not self.known:
             calm = measured & np.all(recent <= self.limit_of(noise), axis=0)
-            at_rest = np.where(calm, mean[:3], np.nan)
-            low = np.fmin.accumulate(np.column_stack([self._lowest, at_rest]), axis=1)[:, 1:]
-            high = np.fmax.accumulate(np.column_stack([self._highest, at_rest]), axis=1)[:, 1:]
-            self._lowest, self._highest = low[:, -1], high[:, -1]
-            scale = _half_range(low, high, noise[:3])
+            scale = self._widen(np.where(calm, mean[:3], np.nan), noise[:3])
         noise[:3] = np.fmax(noise[:3], (STD_FLOOR_G * scale)**2)
         limit = self.limit_of(noise)
         judged['sums']['level'][:, :axes], judged['limit'][:, :axes] = recent.T, limit.T
         judged['missing'], judged['trending'] = missing, self._trending(seen, mean, limit, scale)
         still = measured & (judged['trending'] == 0) & np.all(recent[:3] <= limit[:3], axis=0)
         still &= ~np.any(recent[3:] > limit[3:], axis=0)  # a rate can be NaN
-        if self._settings.still_gyro_max > 0.0:
-            still &= ~(np.sum(mean[3:]**2, axis=0) > self._settings.still_gyro_max**2)
-        judged['still'] = still
+        fastest = self._settings.still_gyro_max or math.inf
+        judged['still'] = still & ~(np.sum(mean[3:]**2, axis=0) > fastest**2)
         return judged
+
+    def _widen(self, at_rest: Floats, noise: Floats) -> Floats:
+        """Return half the range at each chunk, with (3, n) native readings at rest, or NaN."""
+        low = np.fmin.accumulate(np.column_stack([self._lowest, at_rest]), axis=1)[:, 1:]
+        high = np.fmax.accumulate(np.column_stack([self._highest, at_rest]), axis=1)[:, 1:]
+        self._lowest, self._highest = low[:, -1], high[:, -1]
+        return _half_range(low, high, noise)
 
     def is_steep(self, slope: Floats, scale: Floats, variance: Floats, drift_g: float = SLOPE_G
                  ) -> NDArray[np.bool_]:
