@@ -63,22 +63,24 @@ from accel_calib.logs.names import format_named, meaning, NAMES as LOG_FORMATS
 from accel_calib.logs.quantities import are_samples
 from accel_calib.logs.serialized import frame_ids, stamps_of
 from accel_calib.messages.one_reading import OneReading
-from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS, fit_components
-from accel_calib.noise.curve import allan_variances, longest_rest, octaves, shares, spread_of
+from accel_calib.noise.allan import (
+    allan_variances, COMPONENTS as ALLAN_COMPONENTS, fit_components, octaves, shares, spread_of)
+from accel_calib.noise.figures import longest_rest
 from accel_calib.pipeline import (
     calibrated as calibrated_by, Correction, Intake, is_partial, Plan as FitPlan, poses_of,
     RampIntake, thermally_calibrated)
-from accel_calib.refinement import base as refine_base
-from accel_calib.refinement.base import clipped, grid_step, off_grid, sampled, unclipped
-from accel_calib.refinement.beam import accepted, explored, reshaped
+from accel_calib.refinement import search as refine_search
 from accel_calib.refinement.curves import (
-    _grown as grown_curve, _rss_beside as rss_beside, best_curve, FoundCurve, Near, probabilities,
-    Process, process_of, SIGNIFICANT, Walk, walk_beside)
+    _grown as grown_curve, _rss_beside as rss_beside, best_curve, FoundCurve, Process, process_of,
+    SIGNIFICANT, Walk, walk_beside)
 from accel_calib.refinement.linear import (
-    _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, Set, with_outliers)
+    _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, Set, with_outliers)
 from accel_calib.refinement.search import (
-    _is_better as is_better_than_walk, _less as less, search as search_effects)
-from accel_calib.refinement.state import beginning, candidates, fitted_state, linearised, WORTH
+    _is_better as is_better_than_walk, _less as less, sampled, search as search_effects)
+from accel_calib.refinement.settle import accepted, explored, Near, probabilities, reshaped
+from accel_calib.refinement.state import (
+    beginning, candidates, clipped, fitted_state, grid_step, linearised, off_grid, outside_of,
+    unclipped, WORTH)
 from accel_calib.refinement.steps import remarks_on
 from accel_calib.report.page import all_drawings, axis_figures, curve_parts
 from accel_calib.report.residuals import residuals_of
@@ -176,7 +178,7 @@ HEAD_OF_A_PORT = sources, '_HEAD_S'
 MOST_OF_A_HEAD = sources, '_HEAD_CHARACTERS'
 CLOCK_OF_A_SOURCE = sources, 'time'
 PATIENCE_OF_A_WORKER = worker, '_PATIENCE'
-LARGEST_SAMPLE = refine_base, 'MOST'
+LARGEST_SAMPLE = refine_search, 'MOST'
 LARGEST_NUMBER_OF_STEPS = session_store, 'MOST_STEPS'
 PATIENCE_WITH_A_CHILD = child, '_PATIENCE_S'
 
