@@ -62,7 +62,6 @@ from accel_calib.logs.flight import read_dataflash, read_ulg
 from accel_calib.logs.names import format_named, meaning, NAMES as LOG_FORMATS
 from accel_calib.logs.quantities import are_samples
 from accel_calib.logs.serialized import frame_ids, stamps_of
-from accel_calib.messages.one_reading import OneReading
 from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS, fit_components
 from accel_calib.noise.curve import allan_variances, longest_rest, octaves, shares, spread_of
 from accel_calib.pipeline import (
