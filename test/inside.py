@@ -58,11 +58,9 @@ from accel_calib.geometry import (
 from accel_calib.live import sources
 from accel_calib.live.sources import _interval as interval_of_lines, is_port, open_source, Source
 from accel_calib.logs import bag_samples, child, layout_with, LogOptions, open_bag, open_log, text
-from accel_calib.logs.flight import read_dataflash, read_ulg
+from accel_calib.logs.bag import frame_ids, stamps_of
 from accel_calib.logs.names import format_named, meaning, NAMES as LOG_FORMATS
 from accel_calib.logs.quantities import are_samples
-from accel_calib.logs.serialized import frame_ids, stamps_of
-from accel_calib.messages.one_reading import OneReading
 from accel_calib.noise.allan import (
     allan_variances, COMPONENTS as ALLAN_COMPONENTS, fit_components, octaves, shares, spread_of)
 from accel_calib.noise.figures import longest_rest

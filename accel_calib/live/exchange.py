@@ -21,7 +21,7 @@ from ..calibration import Calibration
 from ..errors import InputError
 from ..finding import LEVELS
 from ..findings import angle_words, rate, residual_figures
-from ..messages.one_reading import Triple
+from ..messages import Triple
 from ..report import calibration_page, STORED
 from ..session import (
     Answer, APART, CallSoon, Compute, conditions, Event, Log, progress, Result, run, Session,

@@ -26,13 +26,11 @@ from typing import Any
 import numpy as np
 
 from . import containers
-from .autopilot import FlightLog
 from .bag import open_bag
 from .bag_samples import context_of, FIRST_MESSAGES, imu_samples
 from .child import LogFile, parts_of
-from .columns import Chosen, LogOptions
+from .columns import Chosen, LogOptions, shown
 from .containers import Frame, Member, Piped, Stream
-from .dialect import shown
 from .flight import DATAFLASH, read_dataflash, read_ulg
 from .names import meaning, record_instead
 from .quantities import are_samples, decide_quantities
@@ -117,17 +115,16 @@ def _bag(_: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
 
 @contextmanager
 def _flight(known: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
-    log: FlightLog = known.read(path, options.topic, options.instance)
-    recording = log.recording
+    recording, read_as, notes = known.read(path, options.topic, options.instance)
     check_values(recording.columns, str(path))
     units = units_of('m/s2', options.gravity)
     if options.units not in ('', units.name):
         raise InputError(f'{path} is in {units.name}, but --units is {options.units}',
                          'remove --units')
-    with saying(log.read_as):
+    with saying(read_as):
         check_units(recording, units, str(path))
-    yield OpenLog(iter((recording,)), len(recording), units, recording.sensor, log.read_as,
-                  noted=lambda: log.notes)
+    yield OpenLog(iter((recording,)), len(recording), units, recording.sensor, read_as,
+                  noted=lambda: notes)
 
 
 # ------------------------------------------------------------------------------- binary files

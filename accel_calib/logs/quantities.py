@@ -25,8 +25,7 @@ from typing import Any, cast, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import Chosen, LogOptions, MOST, OF_POSES
-from .dialect import Cells, shown
+from .columns import Cells, Chosen, LogOptions, MOST, OF_POSES, shown
 from .names import DEGREE_RAD, meaning, READING, record_instead, unit_of, ZEROS
 from .times import Clock, clock_of
 from ..errors import InputError, saying

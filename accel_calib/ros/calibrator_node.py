@@ -47,7 +47,7 @@ from ..finding import LEVELS
 from ..findings import request_words
 from ..live import check_installed
 from ..logs import named_topics
-from ..messages.correction import output_frame
+from ..messages import output_frame
 from ..session import (
     CalibratorSettings, CallSoon, Check, COMMANDS, conditions, diagnostics, enable, Event, figures,
     Log, Mounting, progress, Result, run, Session, ShowPoses, Still, Surroundings, Task, Worker)

@@ -35,8 +35,7 @@ from ..errors import AccelCalibError, InputError
 from ..logs import (
     ACCELERATION, field_of, IMU_DOUBLES, joined, Layout, layout_of, LITTLE_ENDIAN, NAME_AT,
     named_topics, samples_of, THREE, topic_and_field)
-from ..messages.correction import motion_of, output_frame, Rewriter
-from ..messages.one_reading import Triple
+from ..messages import motion_of, output_frame, Rewriter, Triple
 from ..session import Around, BATCH, CalibratorSettings, columns_of, Session
 from ..table import Floats
 from ..text import some

@@ -32,8 +32,7 @@ from ..comparison import compared, Drift, rest_errors
 from ..effects import Context
 from ..errors import InputError
 from ..findings import Rating
-from ..messages import output_scale
-from ..messages.one_reading import Known, OneReading, Triple
+from ..messages import Known, OneReading, output_scale, Triple
 from ..refinement import Refinement
 from ..stillness import Dwell
 from ..table import Floats

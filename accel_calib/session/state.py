@@ -26,7 +26,7 @@ from ..comparison import status
 from ..errors import InputError
 from ..finding import has, Level, LEVELS
 from ..logs import named_topics
-from ..messages.one_reading import Triple
+from ..messages import Triple
 from ..pipeline import is_partial
 from ..table import column_of
 from ..text import counted
