@@ -9,7 +9,7 @@ import numpy as np
 
 from .calibration import Calibration
 from ..effects import Context, context_of_samples, entry_of, thermal_stream, variable_of
-from ..statistics import over_axes
+from ..units import over_axes
 
 
 @dataclass(frozen=True)

@@ -48,9 +48,9 @@ from ..comparison import NAMES
 from ..effects import LADDER
 from ..estimate import Prior
 from ..findings import rate_fleet, Rating, scale_of
-from ..statistics import SIGMA_OF_MAD
 from ..table import Floats
 from ..text import counted, short
+from ..units import SIGMA_OF_MAD
 
 MOST_ERRORS = 200
 """Largest number of errors that are kept."""

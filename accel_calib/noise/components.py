@@ -32,8 +32,7 @@ import numpy as np
 import scipy
 
 from .curve import Counts, shares, Spread
-from ..statistics import rms
-from ..units import Floats, is_native, STANDARD_GRAVITY
+from ..units import Floats, is_native, rms, STANDARD_GRAVITY
 
 COMPONENTS = ('quantisation', 'noise_density', 'bias_instability', 'random_walk', 'drift')
 

@@ -28,9 +28,8 @@ from ..effects import (
     Model)
 from ..estimate import estimate, Fit, kinds, left_out, NotConvergedError
 from ..geometry import unit
-from ..statistics import rms
 from ..table import Floats, Poses
-from ..units import MG
+from ..units import MG, rms
 
 WORTH = 4.0
 """ν, degrees of freedom that the measured noise counts as."""

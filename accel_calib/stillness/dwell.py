@@ -58,8 +58,8 @@ from .chunks import (
 from .rule import (
     DWELL_SLOPE_G, HORIZON, RELATIVE, rounding_left, Rule, STRENGTH, SURE, TURN_G, WEAK_STRENGTH)
 from .trend import excess_of_means, lines, strength_of
-from ..statistics import SIGMA_OF_MAD
 from ..table import Floats
+from ..units import SIGMA_OF_MAD
 
 _FIGURES = [
     ('lowest', float, 6),     # lower confidence limit of the mean variance of the windows

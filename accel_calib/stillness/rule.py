@@ -52,9 +52,8 @@ from numpy.typing import NDArray
 from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records
 from .levels import Known, Levels
 from .trend import oscillation, sliding, Stretch, stretch
-from ..statistics import rms
 from ..table import Floats
-from ..units import Units
+from ..units import rms, Units
 
 LONG = 12
 """Number of chunks from which the noise is estimated."""
