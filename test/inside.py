@@ -25,10 +25,10 @@ from accel_calib.calibration.mounting import (
 from accel_calib.calibration.partial import common_sensors, without_knocked
 from accel_calib.calibration.planning import choose_levels, find_undetermined, missing_poses
 from accel_calib.cli.commands import COMMANDS, HIDDEN as DEMO_CHOICES, parser
+from accel_calib.cli.frame import Output, shown
 from accel_calib.cli.main import main
 from accel_calib.cli.nodes import changes, screen, state
 from accel_calib.cli.options import in_one_line
-from accel_calib.cli.output import Output, shown
 from accel_calib.comparison import rotation_free
 from accel_calib.comparison.agreement import (
     on_one_scale, outlier, p_values, Repeatability, repeatability_of, Runs)
