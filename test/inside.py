@@ -45,9 +45,8 @@ from accel_calib.estimate.outliers import _look_alikes as look_alikes
 from accel_calib.findings import mounting_figures
 from accel_calib.findings.figures import number
 from accel_calib.fleet.overview import (
-    digest, digest_of, estimated, Months, not_agreeing, odd_sensors, overview, priors_of,
-    shared_effects, typical_of, Values as SensorValues)
-from accel_calib.fleet.page import write_fleet_page
+    digest, digest_of, estimated, not_agreeing, odd_sensors, OfModel, overview, priors_of,
+    shared_effects, typical_of, Values as SensorValues, write_fleet_page)
 from accel_calib.fleet.recording import (
     as_folder, content_hash, date_of, on_disk, schema, sensor_of)
 from accel_calib.fleet.run import mapped

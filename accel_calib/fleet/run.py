@@ -27,8 +27,7 @@ import threading
 import time
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from .overview import digest_of, overview, priors_of, rating_of
-from .page import write_fleet_page
+from .overview import digest_of, overview, priors_of, rating_of, write_fleet_page
 from .recording import (
     as_folder, content_hash, Input, key_of, on_disk, Options, Row, row_of, schema, unread_row)
 from .sensors import (
