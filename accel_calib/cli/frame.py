@@ -332,8 +332,7 @@ def intake(args: argparse.Namespace, path: Path, calibration: Calibration | None
            ) -> Iterator[Intake]:
     """Yield the poses of a log, captured from a recording; later errors say how it was read."""
     with progress('samples') as moved:
-        found = poses_of(path, log_options(args, calibration),
-                         given(CaptureSettings, args), moved)
+        found = poses_of(path, log_options(args, calibration), given(CaptureSettings, args), moved)
     with saying(found.said):
         yield found
 

@@ -333,7 +333,7 @@ class Expected:
 
     def __init__(self, calibration: Calibration) -> None:
         quality, effects = calibration.quality, calibration.model.effects
-        self.calibration, self.quality = calibration, quality
+        self.calibration, self.quality, self.effects = calibration, quality, effects
         self.poses = calibration.used_poses
         self.directions = directions_in(self.poses, calibration)
         self.noise = pose_noise(self.poses.noise, self.directions)

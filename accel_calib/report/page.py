@@ -21,8 +21,6 @@ standard deviations follow from the covariance of the calibration.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -9,8 +9,6 @@ The residual of each pose before and after a calibration, and its figures.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -12,8 +12,6 @@ the sensitivities.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 import math
 from pathlib import Path
