@@ -25,10 +25,10 @@ from accel_calib.calibration.mounting import (
 from accel_calib.calibration.partial import common_sensors, without_knocked
 from accel_calib.calibration.planning import choose_levels, find_undetermined, missing_poses
 from accel_calib.cli.commands import COMMANDS, HIDDEN as DEMO_CHOICES, parser
+from accel_calib.cli.frame import Output, shown
 from accel_calib.cli.main import main
 from accel_calib.cli.nodes import changes, screen, state
 from accel_calib.cli.options import in_one_line
-from accel_calib.cli.output import Output, shown
 from accel_calib.comparison import rotation_free
 from accel_calib.comparison.agreement import (
     on_one_scale, outlier, p_values, Repeatability, repeatability_of, Runs)
@@ -45,9 +45,8 @@ from accel_calib.estimate.outliers import _look_alikes as look_alikes
 from accel_calib.findings import mounting_figures
 from accel_calib.findings.figures import number
 from accel_calib.fleet.overview import (
-    digest, digest_of, estimated, Months, not_agreeing, odd_sensors, overview, priors_of,
-    shared_effects, typical_of, Values as SensorValues)
-from accel_calib.fleet.page import write_fleet_page
+    digest, digest_of, estimated, not_agreeing, odd_sensors, OfModel, overview, priors_of,
+    shared_effects, typical_of, Values as SensorValues, write_fleet_page)
 from accel_calib.fleet.recording import (
     as_folder, content_hash, date_of, on_disk, schema, sensor_of)
 from accel_calib.fleet.run import mapped

@@ -245,7 +245,7 @@ def test_numbers_have_two_digits_and_one_after_the_point_from_10_to_100(value, e
 def test_poses_of_another_sensor_are_bad_and_noisy_ones_do_not_verify(effects, noise, expected):
     calibration = ac.fit(simulated(poses=24))
     new = simulated(effects, poses=12, noise=noise, seed=9)
-    assert rate_verification(ac.verify(new, calibration), calibration).name == expected
+    assert rate_verification(ac.verify(new, calibration), calibration, new).name == expected
 
 
 def test_a_verification_never_advises_to_replace_what_it_verified(tmp_path):

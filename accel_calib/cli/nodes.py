@@ -31,8 +31,7 @@ from rich.table import Table
 from rich.text import Text
 
 from .commands import HIDDEN
-from .frame import console, Done, FAILED, given, log_options
-from .output import Output, table
+from .frame import console, Done, FAILED, given, log_options, Output, table
 from ..errors import InputError, NEEDS_ROS
 from ..geometry import words_of
 from ..stillness import CaptureSettings

@@ -53,8 +53,7 @@ from typing import Any, BinaryIO, cast, Literal, TypeVar
 
 from .store import writing_advice
 from ..calibration import NextPose
-from ..errors import AccelCalibError, InputError
-from ..one_thread import ONE_THREAD
+from ..errors import AccelCalibError, InputError, ONE_THREAD
 from ..table import Floats
 
 Found = TypeVar('Found')
