@@ -15,7 +15,7 @@ from accel_calib.effects import Covariate
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.finding import Finding, has, LEVELS
 from accel_calib.logs import open_log, read_poses, write_table
-from accel_calib.session import CalibratorSettings, changed, next_step, state, Surroundings
+from accel_calib.session import CalibratorSettings, changed, next_step, progress, Surroundings
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Poses
 from driven import Driver, RATE
@@ -146,11 +146,11 @@ def test_sensor_that_tumbles_from_the_first_second_is_not_still_until_it_rests(
     up = np.column_stack([np.sin(turn) * np.cos(lean), np.sin(lean), np.cos(turn) * np.cos(lean)])
     for block in np.array_split((up + noise) * per_g, 120):
         driver.feed(block)
-        shown.append(state.progress(driver.session.state).still)
+        shown.append(progress(driver.session.state).still)
     assert not any(shown)
     for direction in (*spread_directions(5), np.array([0.6, 0.0, 0.8])):
         driver.feed((direction + noise[:150]) * per_g)
-    now = state.progress(driver.session.state)
+    now = progress(driver.session.state)
     assert now.still
     np.testing.assert_allclose(now.up, (0.6, 0.0, 0.8), atol=0.1)
 
@@ -464,7 +464,7 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
     assert abs(expected[2] - plain[2]) > 0.15
     offered = with_values(*values * [1.0, 1.0, 1.0, 2.0, 1.0])
     driver.session.change_sensor(offered=offered)
-    assert state.progress(driver.session.state).corrected == pytest.approx(
+    assert progress(driver.session.state).corrected == pytest.approx(
         np.linalg.norm(offline(offered)[-1]) / GRAVITY, abs=1e-3)
 
 

@@ -22,10 +22,9 @@ import numpy as np
 
 from . import use
 from .conditions import next_words, thermometer_words
-from .core import Holder, State
-from .sensor import gyro_bias_of_rest, Sensor
+from .state import gyro_bias_of_rest, Sensor, State
 from .store import writing_advice
-from .use import adopt, change_words, Fitted, rate, show_poses
+from .use import adopt, change_words, Fitted, Holder, rate, show_poses
 from .worker import Compute, Files, nothing, Parse, Part, Task
 from ..calibration import (
     Calibration, fit_partial, level, mounting_only, plan_session, set_heading as with_heading)
