@@ -114,7 +114,8 @@ def test_every_person_ends_in_a_calibration_or_in_one_named_reason(
         assert wrong.words in driver.logged('warning')
     if case.ends == 'done':
         assert driver.calibration.is_levelled
-        np.testing.assert_allclose(np.linalg.norm(driver.sensor.gravity), GRAVITY, rtol=5e-3)
+        gravity = np.linalg.norm(driver.session.state.gravity)
+        np.testing.assert_allclose(gravity, GRAVITY, rtol=5e-3)
     assert len(person.called) == len(set(person.called)) or case.ends == 'done'
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
 import math
 from pathlib import Path
@@ -195,7 +195,7 @@ class Host:
 
     def _show(self, event: Event) -> None:
         if isinstance(event, Log):
-            self._print(replace(event, words=re.sub(
+            self._print(event._replace(words=re.sub(
                 r'(call )?~/(\w+)', lambda found: f'{"press " if found[1] else ""}'
                 f'{self._labels.get(found[2], found[0])}', event.words)))
         self.exchange.show_event(event)

@@ -488,7 +488,7 @@ def words_of_state(state: State) -> str:
 def figures(state: State) -> Iterator[tuple[str, str]]:
     """Yield names and values for the diagnostics."""
     sensor, counts, warm = state.sensor, state.statistics, state.around.temperature
-    gravity, rest, drift, live = sensor.gravity, sensor.rest, sensor.drift, sensor.live
+    gravity, rest, drift, live = state.gravity, sensor.rest, sensor.drift, sensor.live
     yield 'state', words_of_state(state)
     yield 'sensor', state.name
     yield 'calibration', 'none' if sensor.calibration is None else title(sensor.calibration)

@@ -84,8 +84,6 @@ class Session(Holder):
         """Replace the settings that can change while the node runs."""
         before = self.state.settings
         self.change(settings=settings)
-        if settings.rotate != before.rotate:
-            self.change(sensor=self.sensor.turn(settings))
         if settings.model != before.model:
             self.change_sensor(guide=self.sensor.guide.choose(None))
             show_poses(self, store=False)

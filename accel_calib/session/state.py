@@ -69,17 +69,14 @@ class Sensor:
     ----------
     live : LiveCapture
         The poses.
-    g : float
-        Local gravity [m/s²].
     guide : Guide
         The next pose.
     temperatures : TemperatureHistory
         What the effects of temperature need.
-    calibration, applied : Calibration or None
-        The calibration in use, and the same as it corrects messages: in their frame, or without
-        the mounting if `rotate` is false.
-    offered, previewed : Calibration or None
-        A calibration that waits for ~/save or ~/undo, and the same in the frame of messages.
+    calibration : Calibration or None
+        The calibration in use.
+    offered : Calibration or None
+        A calibration that waits for ~/save or ~/undo.
     rating, refinement : Rating, Refinement or None
         Rating of the `present` calibration, None while it is not known; and where it is from.
     unsaved : bool
@@ -104,13 +101,10 @@ class Sensor:
     """
 
     live: LiveCapture
-    g: float
     guide: Guide = field(default_factory=Guide)
     temperatures: TemperatureHistory = field(default_factory=TemperatureHistory)
     calibration: Calibration | None = None
-    applied: Calibration | None = None
     offered: Calibration | None = None
-    previewed: Calibration | None = None
     rating: Rating | None = None
     refinement: Refinement | None = None
     unsaved: bool = False
@@ -129,12 +123,11 @@ class Sensor:
         """Return the calibration that a command starts from: the offered one, or that in use."""
         return self.offered or self.calibration
 
-    def offer(self, calibration: Calibration | None, settings: CalibratorSettings) -> Sensor:
+    def offer(self, calibration: Calibration | None) -> Sensor:
         """Publish this calibration on ~/preview only; None: discard the offered one."""
-        return replace(self, offered=calibration, changes=self.changes + 1,
-                       previewed=calibration and on_topics(calibration, settings.frame))
+        return replace(self, offered=calibration, changes=self.changes + 1)
 
-    def adopt(self, calibration: Calibration | None, settings: CalibratorSettings) -> Sensor:
+    def adopt(self, calibration: Calibration | None) -> Sensor:
         """Use this calibration; the drift monitor restarts unless only the mounting differs."""
         before, past, counted = self.calibration, self.past, self.counted
         only_levelled = (
@@ -146,16 +139,8 @@ class Sensor:
         if not only_levelled:
             past, counted = None if calibration is None else Drift(calibration), self.rest
         self.temperatures.followed.clear()  # but for models that are asked for from now on
-        return replace(self.offer(None, settings), calibration=calibration, unsaved=False,
-                       drift=past, past=past, counted=counted).turn(settings)
-
-    def turn(self, settings: CalibratorSettings) -> Sensor:
-        """Turn corrected messages into the levelled frame, or leave them in that of the sensor."""
-        applied = self.calibration
-        if applied is not None:
-            applied = (on_topics(applied, settings.frame) if settings.rotate
-                       else applied.in_sensor_frame)
-        return replace(self, applied=applied)
+        return replace(self.offer(None), calibration=calibration, unsaved=False, drift=past,
+                       past=past, counted=counted)
 
     @property
     def gyro(self) -> GyroBias | None:
@@ -219,23 +204,14 @@ class Sensor:
     def _with(self, rest: Dwell, least: float) -> Drift | None:
         """Return the state of the monitor after what was not counted yet of a rest."""
         part = self._uncounted(rest)
-        context = None if part is None else self._context(part)
+        context = None if part is None else self.known_context(part)
         if self.past is None or self.calibration is None or part is None or context is None:
             return self.past
         noise = part.std[np.newaxis] / math.sqrt(part.count)
         found = rest_errors(self.calibration, part.mean[np.newaxis], noise, context)
         return compared(self.past, found[0], least)
 
-    @cached_property
-    def gravity(self) -> Floats | None:
-        """Corrected force of the last rest, (3,) [m/s²]; None if it cannot be corrected."""
-        context = None if self.rest is None else self._context(self.rest)
-        if self.rest is None or self.applied is None or context is None:
-            return None
-        force = self.applied.correct(self.rest.mean[np.newaxis], context)[0]
-        return force * output_scale(self.applied, self.g)
-
-    def _context(self, rest: Dwell) -> Context | None:
+    def known_context(self, rest: Dwell) -> Context | None:
         """Return the context of a rest, or None if the calibration needs more context."""
         if self.calibration is None:
             return None
@@ -287,8 +263,7 @@ class Sensor:
 
 def new_sensor(settings: CalibratorSettings, units: Units) -> Sensor:
     """Return a sensor without poses and calibration."""
-    return Sensor(LiveCapture(capture_settings(settings), units, columns_of(settings)),
-                  settings.gravity)
+    return Sensor(LiveCapture(capture_settings(settings), units, columns_of(settings)))
 
 
 def gyro_bias_of_rest(rest: Dwell) -> GyroBias | None:
@@ -438,6 +413,24 @@ class State:
         """Present time [s], if known, and the context as a calibration uses it."""
         stamp = self.statistics.stamp
         return {**self.around.filled, **({} if math.isnan(stamp) else {'time': stamp})}
+
+    @cached_property
+    def applied(self) -> Calibration | None:
+        """Return the calibration in use in the frame of messages, or without the mounting."""
+        calibration = self.sensor.calibration
+        if calibration is None or not self.settings.rotate:
+            return calibration and calibration.in_sensor_frame
+        return on_topics(calibration, self.settings.frame)
+
+    @cached_property
+    def gravity(self) -> Floats | None:
+        """Corrected force of the last rest, (3,) [m/s²]; None if it cannot be corrected."""
+        rest, applied = self.sensor.rest, self.applied
+        context = None if rest is None else self.sensor.known_context(rest)
+        if rest is None or applied is None or context is None:
+            return None
+        force = applied.correct(rest.mean[np.newaxis], context)[0]
+        return force * output_scale(applied, self.settings.gravity)
 
     def refusal_of(self, command: str) -> str:
         """Return what to do about a command that would be refused again; empty if it may work."""

@@ -244,7 +244,7 @@ def adopt(session: Holder, calibration: Calibration | None, refinement: Refineme
     session.change(problem='', is_refused=False)
     state, settings = session.state, session.state.settings
     if calibration is None:
-        session.change(sensor=session.sensor.adopt(None, settings))
+        session.change(sensor=session.sensor.adopt(None))
         state.around.assume({})
         rate(session, None)
         return
@@ -257,7 +257,7 @@ def adopt(session: Holder, calibration: Calibration | None, refinement: Refineme
     if levelled and not np.allclose(stored.rotation[:, 2], calibration.rotation[:, 2]):
         session.log('warning', 'the stored mounting differs from the given one by more than 10° '
                     'of tilt: the given mounting is used; call ~/set_level with the robot level')
-    session.change(sensor=session.sensor.adopt(calibration, settings))
+    session.change(sensor=session.sensor.adopt(calibration))
     state.around.assume({key: value for key, value in calibration.typical.items()
                          if key in CONTEXT or is_quantity(key)})
     rate(session, refinement, rating)
