@@ -54,8 +54,6 @@ from accel_calib.fleet.sensors import alike, drift_of, merge_sensor, write_parqu
 from accel_calib.geometry import (
     attitude_words, distinct, OVER_THE_SPHERE, quaternion_of, rotation_from_rpy, spread_directions,
     unit, words_of)
-from accel_calib.live import sources
-from accel_calib.live.sources import _interval as interval_of_lines, is_port, open_source, Source
 from accel_calib.logs import bag_samples, child, layout_with, LogOptions, open_bag, open_log, text
 from accel_calib.logs.bag import frame_ids, stamps_of
 from accel_calib.logs.names import format_named, meaning, NAMES as LOG_FORMATS
@@ -86,12 +84,10 @@ from accel_calib.report.stability import comparison_page
 from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store, worker
 from accel_calib.session.commands import poses_changed
-from accel_calib.session.conditions import step_of
-from accel_calib.session.live_capture import LiveCapture, with_temperature
-from accel_calib.session.pose_guide import Guide
-from accel_calib.session.sensor import new_sensor, rest_after
+from accel_calib.session.conditions import figures, step_of
+from accel_calib.session.poses import Guide, LiveCapture, with_temperature
 from accel_calib.session.settings import capture_settings, changed, default_of
-from accel_calib.session.state import figures
+from accel_calib.session.state import new_sensor, rest_after
 from accel_calib.session.store import (
     aside, MOST_STEPS, SensorFiles, Store as SensorStore, store_of, writing_advice)
 from accel_calib.session.stream import StreamStatistics, TemperatureHistory
@@ -160,7 +156,7 @@ def server_of_children() -> int:
     return process.pid if process else 0
 
 
-PAGE_FOLDER = Path(sources.__file__).parent / 'page'
+PAGE_FOLDER = Path(session_store.__file__).parents[1] / 'live' / 'page'
 """Files of the live page."""
 
 # Limits that a test lowers, because the real ones take too long: arguments of monkeypatch.setattr.
@@ -170,24 +166,25 @@ BLOCK_OF_A_BAG = bag_samples, 'BLOCK'
 MOST_VALUES_READ = plain_yaml, 'MOST_VALUES'
 MOST_BYTES_READ = plain_yaml, 'MOST_BYTES'
 MOST_LETTERS_OF_LABELS = calibration_yaml, '_MOST_LETTERS'
-PATIENCE_OF_A_PORT = sources, '_PATIENCE_S'
-HEAD_OF_A_PORT = sources, '_HEAD_S'
-MOST_OF_A_HEAD = sources, '_HEAD_CHARACTERS'
-CLOCK_OF_A_SOURCE = sources, 'time'
 PATIENCE_OF_A_WORKER = worker, '_PATIENCE'
 LARGEST_SAMPLE = refine_search, 'MOST'
 LARGEST_NUMBER_OF_STEPS = session_store, 'MOST_STEPS'
 PATIENCE_WITH_A_CHILD = child, '_PATIENCE_S'
 
 if find_spec('aiohttp'):  # what the live page needs is not installed everywhere
-    from accel_calib.live import server, viewer
-    from accel_calib.live.host import Host
-    from accel_calib.live.server import PageServer
-    from accel_calib.live.viewer import (
+    from accel_calib.live import exchange, host, server
+    from accel_calib.live.exchange import (
         announce, BUTTONS, LARGEST as LARGEST_LIVE_MESSAGE, PERIOD as LIVE_PERIOD, qr_code,
         reachable)
+    from accel_calib.live.host import (
+        _interval as interval_of_lines, Host, is_port, open_source, Source)
+    from accel_calib.live.server import PageServer
 
-    PATIENCE_FOR_A_HELLO = viewer, '_HELLO_S'
+    CLOCK_OF_A_SOURCE = host, 'time'
+    HEAD_OF_A_PORT = host, '_HEAD_S'
+    MOST_OF_A_HEAD = host, '_HEAD_CHARACTERS'
+    PATIENCE_OF_A_PORT = host, '_PATIENCE_S'
+    PATIENCE_FOR_A_HELLO = exchange, '_HELLO_S'
     PATIENCE_FOR_A_REQUEST = server, '_REQUEST_S'
     PERIOD_OF_A_COMPLAINT = server, '_QUIET_S'
     STUCK = server, 'STUCK_S'

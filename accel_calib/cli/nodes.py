@@ -73,8 +73,7 @@ def run_live(args: argparse.Namespace) -> Done:
     """Serve the live page without ROS until the user ends it."""
     from ..live import check_installed
     check_installed()
-    from ..live.host import Host
-    from ..live.sources import open_source
+    from ..live.host import Host, open_source
     from ..session import CalibratorSettings
 
     output = Output()

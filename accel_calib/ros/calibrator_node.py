@@ -170,9 +170,8 @@ class Calibrator:
             return
         try:  # to serve the live page, in its own thread
             check_installed()
-            from ..live.exchange import Exchange
+            from ..live.exchange import Exchange, PERIOD
             from ..live.server import PageServer
-            from ..live.viewer import PERIOD
             page = Exchange(self.session, self._worker, self._call_soon)
             server = PageServer(page, settings.web_host, settings.web_port)
             server.start()
