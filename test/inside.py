@@ -43,7 +43,6 @@ from accel_calib.estimate.closed_form import agreeing
 from accel_calib.estimate.equations import equations, measured
 from accel_calib.estimate.outliers import _look_alikes as look_alikes
 from accel_calib.findings import mounting_figures
-from accel_calib.findings.figures import number
 from accel_calib.fleet.overview import (
     digest, digest_of, estimated, Months, not_agreeing, odd_sensors, overview, priors_of,
     shared_effects, typical_of, Values as SensorValues)
@@ -59,7 +58,7 @@ from accel_calib.live import sources
 from accel_calib.live.sources import _interval as interval_of_lines, is_port, open_source, Source
 from accel_calib.logs import bag_samples, child, layout_with, LogOptions, open_bag, open_log, text
 from accel_calib.logs.flight import read_dataflash, read_ulg
-from accel_calib.logs.names import format_named, meaning, NAMES as LOG_FORMATS
+from accel_calib.logs.names import format_named, meaning
 from accel_calib.logs.quantities import are_samples
 from accel_calib.logs.serialized import frame_ids, stamps_of
 from accel_calib.messages.one_reading import OneReading
@@ -94,7 +93,7 @@ from accel_calib.session.sensor import new_sensor, rest_after
 from accel_calib.session.settings import capture_settings, changed, default_of
 from accel_calib.session.state import figures
 from accel_calib.session.store import (
-    aside, MOST_STEPS, SensorFiles, Store as SensorStore, store_of, writing_advice)
+    aside, MOST_STEPS, SensorFiles, Store as SensorStore, store_of)
 from accel_calib.session.stream import StreamStatistics, TemperatureHistory
 from accel_calib.session.use import adopt as use_calibration, fit as fit_in_node
 from accel_calib.session.worker import Worker, WorkerProcess
