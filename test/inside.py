@@ -43,7 +43,6 @@ from accel_calib.estimate.closed_form import agreeing
 from accel_calib.estimate.equations import equations, measured
 from accel_calib.estimate.outliers import _look_alikes as look_alikes
 from accel_calib.findings import mounting_figures
-from accel_calib.findings.figures import number
 from accel_calib.fleet.overview import (
     digest, digest_of, estimated, not_agreeing, odd_sensors, OfModel, overview, priors_of,
     shared_effects, typical_of, Values as SensorValues, write_fleet_page)
@@ -56,7 +55,7 @@ from accel_calib.geometry import (
     unit, words_of)
 from accel_calib.logs import bag_samples, child, layout_with, LogOptions, open_bag, open_log, text
 from accel_calib.logs.bag import frame_ids, stamps_of
-from accel_calib.logs.names import format_named, meaning, NAMES as LOG_FORMATS
+from accel_calib.logs.names import format_named, meaning
 from accel_calib.logs.quantities import are_samples
 from accel_calib.noise.allan import (
     allan_variances, COMPONENTS as ALLAN_COMPONENTS, fit_components, octaves, shares, spread_of)
@@ -89,7 +88,7 @@ from accel_calib.session.poses import Guide, LiveCapture, with_temperature
 from accel_calib.session.settings import capture_settings, changed, default_of
 from accel_calib.session.state import new_sensor, rest_after
 from accel_calib.session.store import (
-    aside, MOST_STEPS, SensorFiles, Store as SensorStore, store_of, writing_advice)
+    aside, MOST_STEPS, SensorFiles, Store as SensorStore, store_of)
 from accel_calib.session.stream import StreamStatistics, TemperatureHistory
 from accel_calib.session.use import adopt as use_calibration, fit as fit_in_node
 from accel_calib.session.worker import Worker, WorkerProcess

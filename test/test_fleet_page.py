@@ -349,17 +349,6 @@ def bent(sensor: Model) -> Model:
     return Model({**sensor.values, 'quadratic': np.array([0.012, -0.010, 0.011])})
 
 
-def test_poses_that_carry_no_search_are_refined_to_the_fit_with_the_fleet(
-        fleet: FleetPrior) -> None:
-    rng = np.random.default_rng(7)
-    poses = poses_of(bent(a_sensor(rng)), 6, rng)
-    result, fitted = refine(poses, G, base=fleet), fit_with_fleet(poses, G, fleet)
-    np.testing.assert_array_equal(result.calibration.model.vector, fitted.model.vector)
-    assert result.steps == ()
-    assert all(each in result.advice[0] for each in ('6 poses', 'at least 9'))
-    assert 'directions' in dict(result.not_testable)['quadratic']
-
-
 def test_a_refinement_with_the_fleet_finds_an_effect_beyond_it(fleet: FleetPrior) -> None:
     rng = np.random.default_rng(8)
     sensor = bent(a_sensor(rng))

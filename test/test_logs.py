@@ -14,11 +14,9 @@ import tracemalloc
 from typing import Any
 import zipfile
 
-from accel_calib.calibration import fit_poses
 from accel_calib.errors import InputError
 from accel_calib.fleet import recordings
 from accel_calib.logs import FORMATS, LogOptions, open_log, SUFFIXES
-from accel_calib.stillness import capture
 from accel_calib.table import Recording
 from inside import model_with, read_log, simulate_recording, spread_directions
 import numpy as np
@@ -61,16 +59,6 @@ def write(folder: Path, content: Any, name: str = 'log.csv') -> Path:
     else:
         path.write_bytes(content.encode() if isinstance(content, str) else content)
     return path
-
-
-def test_the_log_of_a_microcontroller_is_calibrated_in_counts(tmp_path: Path) -> None:
-    made = samples(per_g=16512.0)
-    rows = rows_of(made['time'] * 1e3, made['reading'], digits='.0f')
-    log = read_log(write(tmp_path, text_of(rows, 'timestamp_ms,accX,accY,accZ')))
-    assert log.units.name == 'native'
-    poses = capture(log.table, log.units).poses
-    calibration = fit_poses(poses, log.units, model='7')
-    np.testing.assert_allclose(np.diag(calibration.gain) / 16512.0, GAIN, rtol=1e-3)
 
 
 def test_a_cut_last_line_is_left_out_and_noted_also_alone_in_its_block(tmp_path: Path) -> None:

@@ -286,16 +286,6 @@ def test_an_effect_of_temperature_leads_to_refine_and_is_kept_by_a_fit() -> None
     assert next_step(driver.session.state).kind == 'done'
 
 
-def test_without_messages_or_in_another_unit_the_stream_comes_first() -> None:
-    driver = Driver()
-    assert next_step(driver.session.state).kind == 'connect'
-    driver.session.change(surroundings=Surroundings(imus=('/camera/imu',)))
-    assert next_step(driver.session.state).text.endswith(' /camera/imu')
-    person = Person(driver, lambda up, temperature: GRAVITY * healthy(up, temperature))
-    person.rest(person.flat)
-    assert next_step(driver.session.state).kind == 'unit'
-
-
 def test_each_fit_refinement_and_levelling_is_reported_as_on_the_command_line(
         capsys: pytest.CaptureFixture[str]) -> None:
     driver, person = followed(warming, warms=1.2, sensor='arm')

@@ -4,9 +4,7 @@
 """The calibrator without ROS: files of each sensor, accepted messages and refusals."""
 
 from dataclasses import replace
-import errno
 from pathlib import Path
-import re
 import shutil
 from typing import Any
 
@@ -21,7 +19,7 @@ from accel_calib.table import Poses
 from driven import Driver, RATE
 from inside import (
     LARGEST_NUMBER_OF_STEPS, Model, poses_changed, rotation_from_rpy, SensorStore,
-    spread_directions, store_of, StreamStatistics, use_calibration, writing_advice)
+    spread_directions, store_of, StreamStatistics, use_calibration)
 import numpy as np
 import pytest
 from shared import GRAVITY, python, Readings, ROOT, rows_of, Stored, table, with_effects
@@ -283,21 +281,6 @@ def test_reset_removes_poses_and_calibration_but_keeps_the_files(
     assert len(read_poses(home / 'arm_poses.csv.reset1')) == 12
 
 
-def test_context_outside_of_the_ranges_is_limited_with_a_warning(
-        stored: Stored, readings: Readings) -> None:
-    path = stored(sensor='imu_link')
-    write_calibration(path, with_effects(
-        read_calibration(path), {'offset_temperature': [1e-3, 0.0, 0.0]},
-        temperature=np.linspace(20.0, 30.0, 20)))
-    driver, forces = Driver(calibration_file=str(path)), []
-    for temperature, severity in ((25.0, 'GOOD'), (30.0, 'GOOD'), (40.0, 'USABLE')):
-        driver.feed(readings([UP])[:50], temperature=temperature)
-        assert driver.finding('calibration').level == severity
-        forces.append(driver.sensor.force_of((0.0, 0.0, GRAVITY), driver.session.state.context)[0])
-    assert re.findall(r'\d+', driver.finding('calibration').words) == ['40', '20', '30']
-    assert forces[0] != forces[1] == forces[2]
-
-
 # Guidance
 
 
@@ -370,14 +353,6 @@ def statistics_of(*batches: Any, pause: float = 0.3) -> StreamStatistics:
     return found
 
 
-@pytest.mark.parametrize(('length', 'unit'), [(1.0, 'g'), (16384.0, 'native'), (9.8, '')])
-def test_readings_in_another_unit_name_it(length: float, unit: str) -> None:
-    driver = Driver()
-    driver.feed(np.full((50, 3), [0.0, 0.0, length]))
-    words = driver.finding('stream').words
-    assert words.endswith(f'units:={unit}') if unit else 'units' not in words
-
-
 def test_rate_and_faults_of_the_stamps_follow_the_last_seconds() -> None:
     times = [np.arange(60) / 200.0 + 0.3 * k for k in range(30)]
     found = statistics_of(*times)
@@ -428,11 +403,6 @@ def test_a_step_that_cannot_be_used_leaves_the_file_in_use(stored: Stored) -> No
         store.step_back()
     assert path.read_text() == before
     assert step.exists()
-
-
-def test_advice_about_a_file_that_cannot_be_written_differs_by_the_reason() -> None:
-    reasons = errno.ENOSPC, errno.EROFS, errno.EACCES
-    assert len({writing_advice(OSError(each, 'reason')) for each in reasons}) == len(reasons)
 
 
 @pytest.mark.parametrize('of_sensor', [0.0, 1.0])
