@@ -41,7 +41,7 @@ from ..effects import (
     add_history, CHANGES, EffectKey, included, Model, MODELS, OwnEffect, parameter_names,
     PROCESSES, unchanged, with_vector)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
-from ..estimate import fit_sphere, judge, NotConvergedError, outliers, variance_factor
+from ..estimate import fit_sphere, judge, NotConvergedError, originals, outliers, variance_factor
 from ..finding import explained_by, Finding, without as without_kinds
 from ..geometry import unit
 from ..table import check_units, Floats, Poses, Record
@@ -216,6 +216,8 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
                               f'{_LEAST_POSES} to find an effect', 'take 24 poses or more')
     stored = base if isinstance(base, Calibration) else None
     calibration = stored or base_of(poses, units, str(base))
+    # Copies would count as further evidence, and leave nothing unseen that is held out.
+    sound = sound.take(np.unique(originals(in_g(sound, calibration.units))))
 
     def at(model: Model) -> Poses:
         known = add_history(in_g(sound, calibration.units), model)
