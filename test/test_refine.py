@@ -3,12 +3,14 @@
 
 """Hidden effects are named and no others, on data of an independent generator."""
 
+from dataclasses import replace
 import re
 
 import accel_calib as ac
 from accel_calib.effects import between_steps
 from accel_calib.logs import read_poses
 from accel_calib.refinement import refine
+from accel_calib.table import numbered
 import generator
 from inside import LARGEST_SAMPLE, model_with, simulate_poses, spread_directions
 import numpy as np
@@ -293,6 +295,16 @@ def test_shared_orientation_shows_temperature_across_gravity():
     assert names(found) == ['offset_temperature']
     values = found.calibration.model.values['offset_temperature']
     np.testing.assert_allclose(values, [5e-4, 4e-4, -4e-4, 0.0, 0.0], atol=3e-5)  # without lag
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_rows_that_are_copies_are_no_further_evidence(seed, taken):
+    poses, _ = taken(seed, {'offset_temperature': 5.0}, poses=30)
+    again = poses.take(np.tile(np.arange(30), 2))
+    once, found = (refine(each, MPS2) for each in (
+        poses, replace(again, row=numbered(again.columns))))
+    assert [step.effect for step in found.steps] == [step.effect for step in once.steps]
+    assert found.remaining_gap_mg == pytest.approx(once.remaining_gap_mg)
 
 
 def test_a_long_table_is_refined_from_a_sample_and_says_so(monkeypatch):

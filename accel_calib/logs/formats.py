@@ -39,7 +39,7 @@ from ..disk import check_regular, FIRST_LINE
 from ..errors import DamagedLogError, InputError, needing, saying
 from ..finding import Finding
 from ..table import check_units, check_values, concatenated, CONTEXT, Poses, Recording
-from ..text import counted, some
+from ..text import counted
 from ..units import Units, units_of
 
 _HEAD, _TAIL = 8192, 65536
@@ -257,12 +257,14 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
                 count = max(count, int(text.size / width / max(text.characters, 1) * count))
         else:
             rows = concatenated([head, *blocks])
-            lacking = [] if options.partial else [
-                key for key in (*CONTEXT, *rows.quantities)
-                if key in rows and not np.isfinite(rows[key]).all()]
-            if lacking:
-                quantities.notes.append(
-                    f'not used, because cells are not numbers: {some(lacking)}')
+            holes = {} if options.partial else {
+                key: np.flatnonzero(~np.isfinite(rows[key]))
+                for key in (*CONTEXT, *rows.quantities) if key in rows}
+            lacking = [key for key, empty in holes.items() if len(empty)]
+            quantities.findings += [
+                Finding('columns', f'not used, because {len(holes[key])} of {len(rows)} cells are '
+                        f'not numbers: {key}', 'fill in these cells, or remove their rows',
+                        rows=tuple(rows.row[holes[key]].tolist())) for key in lacking]
             if 'time' not in rows and are_samples(rows.columns):
                 raise InputError(
                     f'{path} has no times, but its {len(rows)} rows look like samples of a '

@@ -48,7 +48,8 @@ from ..effects import (
     add_history, covariance_of_steps, EffectKey, Model, MODELS, OwnEffect, PROCESSES, unchanged,
     with_vector)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
-from ..estimate import estimate, fit_sphere, judge, NotConvergedError, outliers, variance_factor
+from ..estimate import (
+    estimate, fit_sphere, judge, NotConvergedError, originals, outliers, variance_factor)
 from ..finding import explained_by, Finding, has, without as without_kinds
 from ..geometry import unit
 from ..table import check_units, Floats, Poses, Record
@@ -229,6 +230,8 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
                               f'{_LEAST_POSES} to find an effect', 'take 24 poses or more')
     stored = base if isinstance(base, Calibration) else None
     calibration = stored or base_of(poses, units, str(base))
+    # Copies would count as further evidence, and leave nothing unseen that is held out.
+    sound = sound.take(np.unique(originals(in_g(sound, calibration.units))))
 
     def at(model: Model) -> Poses:
         known = add_history(in_g(sound, calibration.units), model)
