@@ -46,8 +46,8 @@ import scipy
 from .calibration import Calibration, PRIOR, Quality
 from .quality import finished, gated, in_g, record_of
 from ..effects import (
-    add_history, Context, EFFECTS, entry_of, factors_of, Model, OFFSET_POWERS, parameter_names,
-    REFERENCE_TEMPERATURE, sensor_force, with_vector)
+    add_history, Context, EffectKey, EFFECTS, entry_of, factors_of, Model, OFFSET_POWERS,
+    parameter_names, REFERENCE_TEMPERATURE, sensor_force, with_vector)
 from ..errors import InputError
 from ..estimate import judge
 from ..finding import Finding
@@ -86,7 +86,7 @@ as likely a bend that the effects lack."""
 _ROWS, _ROWS_OF_RATE = 24, 72
 """Number of rows that stand for a ramp among the poses of a calibration; if the rate acts."""
 
-_UNCHANGED = {_LINEAR: np.zeros(3)}
+_UNCHANGED: dict[EffectKey, Floats] = {_LINEAR: np.zeros(3)}
 """What is stored if the offset does not change."""
 
 Form = Mapping[str, Floats]
