@@ -165,6 +165,7 @@ PAGE_FOLDER = Path(sources.__file__).parent / 'page'
 # Limits that a test lowers, because the real ones take too long: arguments of monkeypatch.setattr.
 ROWS_OF_A_TEXT = text, 'ROWS'
 ROWS_OF_A_BAG = bag_samples, '_ROWS'
+BLOCK_OF_A_BAG = bag_samples, 'BLOCK'
 MOST_VALUES_READ = plain_yaml, 'MOST_VALUES'
 MOST_BYTES_READ = plain_yaml, 'MOST_BYTES'
 MOST_LETTERS_OF_LABELS = calibration_yaml, '_MOST_LETTERS'

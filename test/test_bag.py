@@ -24,7 +24,8 @@ from bag_files import (
     check_refused, header, IMU, imu, MAKES, McapFile, RATE_NS, rosbag2, START, STORE, STRING,
     TEMPERATURE, write_bag)
 from inside import (
-    read_log, rotation_from_rpy, ROWS_OF_A_BAG, simulate_recording, spread_directions)
+    BLOCK_OF_A_BAG, read_log, rotation_from_rpy, ROWS_OF_A_BAG, simulate_recording,
+    spread_directions)
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
@@ -307,7 +308,8 @@ def test_a_topic_without_messages_is_reported_in_one_line(make, tmp_path):
 def test_poses_do_not_depend_on_the_size_of_blocks(recording, tmp_path, monkeypatch):
     path = write_bag(tmp_path / 'in', 'mcap', recording)
     whole = capture(read_recording(path), MPS2)
-    monkeypatch.setattr(*ROWS_OF_A_BAG, 20)
+    monkeypatch.setattr(*ROWS_OF_A_BAG, 50)
+    monkeypatch.setattr(*BLOCK_OF_A_BAG, 20)
     with open_log(path, LogOptions(in_child=False)) as stream:
         assert stream.samples == len(recording)
         assert re.search(r'/\S+.* \d+ Hz.*m/s2$', stream.read_as)

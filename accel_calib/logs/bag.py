@@ -261,7 +261,7 @@ BLOCK = 4096
 LARGEST = 1e6
 """Larger accelerations [m/s²] and rates [rad/s] are those of damaged bytes."""
 
-_BLOCK_BYTES = 1 << 25
+_BLOCK_BYTES = 1 << 24
 """Number of bytes above which a block ends."""
 
 NUMBERS = ('float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32', 'int64',

@@ -29,10 +29,11 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from .bag import (
-    Bag, doubles_at, imus_of, NANO, NUMBERS, open_bag, Received, stamps_of, TEMPERATURE, types_of)
+    Bag, BLOCK, doubles_at, imus_of, NANO, NUMBERS, open_bag, Received, stamps_of, TEMPERATURE,
+    types_of)
 from .names import ZEROS
 from ..errors import InputError
-from ..table import CONTEXT, Floats, quantity_key, Recording
+from ..table import concatenated, CONTEXT, Floats, quantity_key, Recording
 from ..text import counted, listed, some
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ _OF_TYPE = {TEMPERATURE: 'temperature', 'sensor_msgs/msg/BatteryState': 'supply_
 """Columns of types whose definition names other quantities, too."""
 
 _ROWS = 65536
-"""Number of messages in a block of a recording."""
+"""Smallest number of samples in a block of a recording."""
 
 FIRST_MESSAGES = 100
 """Number of messages at the beginning of a topic that show its clock and its unit."""
@@ -329,15 +330,20 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool,
 
     """
     tracks = {source.quantity.key: source.track() for source in context}
+    parts: list[Recording] = []
     before = 0
-    for block in bag.blocks(bag.connections(topic), _ROWS):
+    for block in bag.blocks(bag.connections(topic), BLOCK):
         messages = bag.joined(block, topic, before=before)
         columns, which = imus_of(messages, f'{bag.path}, {topic}', before, sensor, chosen=chosen)
         columns |= {key: np.interp(columns['time'], *track) for key, track in tracks.items()}
         samples = Recording(columns, before + np.arange(len(block)) + 1, 'm/s2', sensor)
+        parts.append(samples if np.all(which) else samples.take(which))
         before += len(block)
-        if np.any(which):
-            yield samples.take(which)
+        if sum(map(len, parts)) >= _ROWS:
+            yield concatenated(parts)
+            parts = []
+    if parts:
+        yield concatenated(parts)
     notes += bag.lost(topic, before)
 
 
