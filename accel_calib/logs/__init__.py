@@ -14,8 +14,8 @@ from .autopilot import ARDUPILOT_REFERENCE, ByAxis, DEGREE, PER_MILLION
 from .bag import (
     ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
     doubles_at, IMU_DOUBLES, imus_of, joined, Layout, layout_of, layout_with, LITTLE_ENDIAN,
-    Messages, NAME_AT, NINE, open_bag, ORIENTATION, ORIENTATION_COVARIANCE, put_doubles, renamed,
-    samples_of, STAMP, STAMP_AT, THREE)
+    NAME_AT, NINE, open_bag, ORIENTATION, ORIENTATION_COVARIANCE, rewritten, samples_of, STAMP,
+    STAMP_AT, THREE)
 from .bag_samples import field_of, messages_of, named_topics, topic_and_field
 from .child import parts_of
 from .columns import LogOptions
@@ -30,8 +30,8 @@ __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
            'ANGULAR_VELOCITY_COVARIANCE', 'ARDUPILOT_REFERENCE', 'BAG', 'DEGREE', 'FORMATS',
            'IMU_DOUBLES', 'LITTLE_ENDIAN', 'NAMES', 'NAME_AT', 'NINE', 'ORIENTATION',
            'ORIENTATION_COVARIANCE', 'PER_MILLION', 'STAMP', 'STAMP_AT', 'SUFFIXES', 'THREE',
-           'ByAxis', 'Frame', 'Layout', 'LineReader', 'LogOptions', 'Messages', 'OpenLog', 'Piped',
-           'Progress', 'are_samples', 'doubles_at', 'field_of', 'imus_of',
-           'is_bag', 'joined', 'layout_of', 'layout_with', 'messages_of', 'named_topics',
-           'open_bag', 'open_log', 'parts_of', 'put_doubles', 'read_poses', 'read_recording',
-           'renamed', 'samples_of', 'topic_and_field', 'write_blocks', 'write_table']
+           'ByAxis', 'Frame', 'Layout', 'LineReader', 'LogOptions', 'OpenLog', 'Piped', 'Progress',
+           'are_samples', 'doubles_at', 'field_of', 'imus_of', 'is_bag', 'joined', 'layout_of',
+           'layout_with', 'messages_of', 'named_topics', 'open_bag', 'open_log', 'parts_of',
+           'read_poses', 'read_recording', 'rewritten', 'samples_of', 'topic_and_field',
+           'write_blocks', 'write_table']

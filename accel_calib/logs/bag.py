@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 import shutil
@@ -146,17 +146,11 @@ class Messages:
     def __len__(self) -> int:
         return len(self.start)
 
-    def each(self) -> Iterator[memoryview]:
-        """Yield the messages one by one."""
-        data = self.data.data
-        for start, stop in zip(self.start.tolist(), self.stop.tolist(), strict=True):
-            yield data[start:stop]
-
 
 def joined(raws: Sequence[bytes | memoryview], doubles: int, name: str, *, ros2: bool = True,
            before: int = 0) -> Messages:
     """
-    Copy messages with a header and this number of doubles into one writable buffer.
+    Copy messages with a header and this number of doubles into one buffer.
 
     For errors, `name` is the topic, and `before` the number of its earlier messages.
 
@@ -168,7 +162,7 @@ def joined(raws: Sequence[bytes | memoryview], doubles: int, name: str, *, ros2:
     """
     stop = np.cumsum(np.fromiter(map(len, raws), np.int64, len(raws)))
     start = np.concatenate([np.zeros(1, np.int64), stop])[:-1]
-    data = np.frombuffer(bytearray().join(raws), np.uint8)
+    data = np.frombuffer(b''.join(raws), np.uint8)
     size = stop - start
     _check(size >= LETTERS_AT + 8 * doubles, size, name, before)
     head = sliding_window_view(data, LETTERS_AT)[start].view('<u4')
@@ -222,30 +216,21 @@ def doubles_at(messages: Messages, which: slice) -> Floats:
     return values
 
 
-def put_doubles(messages: Messages, values: Floats) -> None:
-    """Write all (n, k) doubles into the buffer of the messages."""
-    stored = np.ascontiguousarray(values, '<f8')
-    if np.any(messages.swapped):
-        stored = np.where(messages.swapped[:, np.newaxis], stored.byteswap(), stored)
-    rows = stored.view(np.uint8)
-    sliding_window_view(messages.data, rows.shape[1], writeable=True)[messages.begin] = rows
-
-
-def renamed(messages: Messages, frame_id: str) -> Messages:
-    """Return Imu messages with another frame_id, in a new buffer."""
-    letters = frame_id.encode() + (b'\0' if messages.ros2 else b'')
-    begin = int(begin_of(len(letters), ros2=messages.ros2))
-    size = begin + 8 * IMU_DOUBLES
-    rows = np.zeros((len(messages), size), np.uint8)
-    rows[:, :LETTERS_AT] = sliding_window_view(messages.data, LETTERS_AT)[messages.start]
-    length = np.where(messages.swapped, np.uint32(len(letters)).byteswap(), len(letters))
-    rows[:, NAME_AT:LETTERS_AT] = length.astype('<u4')[:, np.newaxis].view(np.uint8)
-    rows[:, LETTERS_AT:LETTERS_AT + len(letters)] = np.frombuffer(letters, np.uint8)
-    rows[:, begin:] = sliding_window_view(messages.data, size - begin)[messages.begin]
-    start, head = np.arange(len(messages)) * size, messages.head.copy()
-    head[:, 3] = len(letters)
-    return replace(messages, data=rows.ravel(), start=start, stop=start + size, head=head,
-                   begin=start + begin)
+def rewritten(messages: Messages, values: Floats, frame_id: str | None) -> Iterator[bytes]:
+    """Yield messages with all their (n, k) doubles replaced, and their frame_id, if not None."""
+    stored, data = values.astype('<f8'), messages.data.data
+    stored[messages.swapped] = stored[messages.swapped].byteswap()
+    letters = (frame_id or '').encode() + (b'\0' if messages.ros2 else b'')
+    size = begin_of(len(letters), ros2=messages.ros2)
+    for doubles, start, begin, stop, swapped in zip(stored, *(each.tolist() for each in (
+            messages.start, messages.begin, messages.stop, messages.swapped)), strict=True):
+        body = doubles.tobytes()
+        if frame_id is None:
+            yield bytes(data[start:begin]) + body + data[begin + len(body):stop]
+        else:
+            length = len(letters).to_bytes(4, 'big' if swapped else 'little')
+            head = bytes(data[start:start + NAME_AT]) + length + letters
+            yield head.ljust(size, b'\0') + body
 
 
 def samples_of(messages: Messages) -> dict[str, Floats]:

@@ -43,13 +43,11 @@ BY_ORDER: Mapping[int, tuple[str, ...]] = {
 OF_POSES = {'count', 'orientation', 'std'}
 """Columns that only poses have."""
 
-
 _FIRST_ROWS = 5
 """Number of rows that show whether a column has numbers, dates or other text."""
 
 MOST = 5000
 """Number of columns among which names other than our own are looked for."""
-
 
 MONITOR = re.compile(r'^(\d{1,2}:\d{2}:\d{2}(?:\.\d+)?) -> ')
 """Time that the serial monitor of the Arduino IDE puts before a line."""
@@ -214,6 +212,13 @@ class TextLayout:
         """Return the first cells of a column."""
         return [row[column] for row in self.sample if column < len(row)]
 
+    def step(self, column: int) -> float:
+        """Return the median step between the first numbers of a column; 0 without numbers."""
+        cells = self.first(column)
+        if len(cells) < 2 or not all(map(is_number, cells)):
+            return 0.0
+        return float(np.median(np.diff([float(cell) for cell in cells])))
+
     def name(self, column: int) -> str:
         """Return the name of a column, or its number from 1."""
         has_name = column < len(self.header) and self.header[column]
@@ -327,7 +332,7 @@ def choose_columns(layout: TextLayout, options: LogOptions) -> Chosen:
     given = options.columns
     if maker is None or set(READING) & given.keys():
         maker, found = None, _sources(layout, given)
-        counted = _counter(layout) if options.rate or layout.rate_hz else None
+        counted = counter_of(layout) if options.rate or layout.rate_hz else None
         if counted and 'time' not in found and 'time' not in given:
             found['time'] = counted
     else:
@@ -459,7 +464,7 @@ def _readings(layout: TextLayout) -> dict[str, Source]:
                      'name them with --columns ax=NAME,ay=NAME,az=NAME')
 
 
-def _named(quantity: str, header: Sequence[str]) -> dict[int, Meaning]:
+def columns_named(quantity: str, header: Sequence[str]) -> dict[int, Meaning]:
     """Return the meanings of the names that mean a quantity, by the index of their columns."""
     return {k: meaning(name) for k, name in enumerate(header[:MOST])
             if meaning(name).quantity == quantity}
@@ -468,7 +473,7 @@ def _named(quantity: str, header: Sequence[str]) -> dict[int, Meaning]:
 def _triples(quantity: str, header: Sequence[str]) -> dict[tuple[str, ...], list[int]]:
     """Return the columns of the three axes of each sensor of a quantity."""
     axes: dict[tuple[str, ...], dict[int, list[int]]] = {}
-    for k, known in _named(quantity, header).items():
+    for k, known in columns_named(quantity, header).items():
         if known.axis is not None:
             axes.setdefault(known.group, {}).setdefault(known.axis, []).append(k)
     found: dict[tuple[str, ...], list[int]] = {}
@@ -487,7 +492,7 @@ def _bare(header: Sequence[str]) -> list[list[int]]:
     if 'w' in map(str.casefold, header):
         return []
     axes: dict[int, list[int]] = {}
-    for k, known in _named('', header).items():
+    for k, known in columns_named('', header).items():
         if not known.unit and known.axis is not None and BARE.issuperset(known.group):
             axes.setdefault(known.axis, []).append(k)
     count = min(len(axes.get(axis, ())) for axis in range(3))
@@ -499,7 +504,7 @@ def _contexts(layout: TextLayout, found: Mapping[str, Source]) -> dict[str, Sour
     header = layout.header
     # Columns of times that run, and how finely. A date that stays the same, or a time of the day
     # in whole seconds, is no clock of the samples.
-    cells = {k: layout.first(k) for k in _named('time', header) if 'time' not in found}
+    cells = {k: layout.first(k) for k in columns_named('time', header) if 'time' not in found}
     different = {k: len(set(texts)) for k, texts in cells.items()
                  if all(is_number(text.replace(',', '.')) or is_clock(text)
                         for text in texts[:_FIRST_ROWS])}
@@ -523,45 +528,24 @@ def _contexts(layout: TextLayout, found: Mapping[str, Source]) -> dict[str, Sour
         more |= {name: _source(layout, k) for triple in gyros.values()
                  for name, k in zip(RATE, triple)}
     for key in CONTEXT:
-        which = [*_named(key, header)]
+        which = [*columns_named(key, header)]
         if key not in found and len(which) == 1:
             more[key] = _source(layout, which[0])
     return more
 
 
-def _counter(layout: TextLayout) -> Source | None:
+def counter_of(layout: TextLayout) -> Source | None:
     """Return the column that counts the samples, or None."""
     return next((_source(layout, k) for k, name in enumerate(layout.header[:MOST])
                  if bare_name(name) in COUNTERS and len(layout.first(k)) >= _FIRST_ROWS
-                 and _step_of(layout, k) > 0.0), None)
-
-
-def _step_of(layout: TextLayout, index: int) -> float:
-    """Return the median step between the first numbers of a column; 0 if they are no numbers."""
-    cells = layout.first(index)
-    if len(cells) < 2 or not all(map(is_number, cells)):
-        return 0.0
-    return float(np.median(np.diff([float(cell) for cell in cells])))
-
-
-def rates_beside(layout: TextLayout, time: Source) -> list[float]:
-    """Return the rates of the rows that the file states [Hz]: in words, or by another clock."""
-    rates = []
-    counted = _counter(layout)
-    if layout.rate_hz is not None:
-        rates.append(layout.rate_hz / (_step_of(layout, counted.index) if counted else 1.0))
-    for k, known in _named('time', layout.header).items():
-        unit, step = unit_of('time', known.unit), _step_of(layout, k)
-        if unit is not None and k != time.index and step > 0.0:
-            rates.append(1.0 / (unit[1] * step))
-    return rates
+                 and layout.step(k) > 0.0), None)
 
 
 def _fraction(layout: TextLayout, best: int) -> dict[str, Source]:
     """Return the column of the nanoseconds beside whole seconds, as ROS stamps have it."""
     known = meaning(layout.header[best])
     if unit_of('time', known.unit) == ('s', 1.0):
-        for k, other in _named('time', layout.header).items():
+        for k, other in columns_named('time', layout.header).items():
             if other.group == known.group and unit_of('time', other.unit) == ('ns', 1e-9):
                 return {FRACTION: _source(layout, k)}
     return {}

@@ -148,7 +148,7 @@ def _binary(known: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLo
 
 def _parts(path: Path, known: 'Format', options: LogOptions) -> Generator[Any]:
     """Yield the fields of an `OpenLog`, its blocks, and its notes at the end."""
-    with known.opened(known, path, options) as log, saying(log.read_as):
+    with known.opened(known, path, options) as log:
         head = {**vars(log), 'noted': log.noted()}
         del head['blocks']
         yield head

@@ -324,7 +324,7 @@ _BLACKBOX_TIMES = {'time (us)': MICRO, 'time (ms)': MILLI, 'time (s)': 1.0, 'tim
 _BLACKBOX_UNITS: dict[str, UnitName] = {'': 'native', ' (g)': 'g', ' (m/s/s)': 'm/s2'}
 _BLACKBOX_RATES = {'gyroADC[{012}] (deg/s)': DEGREE_RAD, 'gyroADC[{012}] (rad/s)': 1.0, '': 0.0}
 
-FORMATS: tuple[LogFormat, ...] = (
+LAYOUTS: tuple[LogFormat, ...] = (
     # phyphox: https://github.com/phyphox/phyphox-android
     # The data sets of the app's own experiments, and of those made with "Add simple experiment".
     # Both apps multiply by ±9.81 so that a phone with its screen up reads +z.
@@ -391,19 +391,19 @@ FORMATS: tuple[LogFormat, ...] = (
     # table of names finds the columns, and the readings at rest determine the unit.
     LogFormat('esp32', {}, units='', plain=False))
 
-NAMES: tuple[str, ...] = tuple(dict.fromkeys(each.name for each in FORMATS))
+NAMES: tuple[str, ...] = tuple(dict.fromkeys(each.name for each in LAYOUTS))
 """Names of the formats, as ``--format`` has them."""
 
 
 def recognise(header: Sequence[str]) -> LogFormat | None:
     """Return the layout whose names a header has, or None; the one with most names, if several."""
-    fitting = [each for each in FORMATS if each.plain and not each.lacking(header)]
+    fitting = [each for each in LAYOUTS if each.plain and not each.lacking(header)]
     return max(fitting, key=lambda each: len(each.needed), default=None)
 
 
 def format_named(name: str, header: Sequence[str], source: str) -> LogFormat:
     """Return the layout of a maker, one of `NAMES`, that a header has; InputError if none."""
-    layouts = [each for each in FORMATS if each.name == name]
+    layouts = [each for each in LAYOUTS if each.name == name]
     if not layouts:
         close = get_close_matches(name, NAMES, 1)
         raise InputError(f'format is {name!r}, expected one of {", ".join(NAMES)}',
@@ -434,7 +434,7 @@ def record_instead(header: Sequence[str], path: Path) -> str:
 
     """
     given = {folded(name) for name in header}
-    for layout in FORMATS:
+    for layout in LAYOUTS:
         marks = {folded(name) for name in layout.without_gravity if not name.endswith('.csv')}
         if (marks and marks <= given) or (
                 layout.plain and not layout.lacking(header)

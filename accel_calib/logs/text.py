@@ -477,10 +477,8 @@ class LineReader:
 
     def samples(self, lines: Sequence[str]) -> Recording | None:
         """Return the samples of the next complete lines; None if there are none."""
-        cells = self._table.read([f'{line}\n' for line in lines])
-        if not len(cells.row):
-            return None
-        columns, row = self._quantities.columns(cells, self._name)
+        columns, row = self._quantities.columns(
+            self._table.read([f'{line}\n' for line in lines]), self._name)
         return Recording(columns, row, self.units.name) if len(row) else None
 
 

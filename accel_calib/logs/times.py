@@ -25,7 +25,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import Cells, Chosen, CLOCK, EPOCH_S, FRACTION, LogOptions, rates_beside, RATES_HZ
+from .columns import (
+    Cells, Chosen, CLOCK, columns_named, counter_of, EPOCH_S, FRACTION, LogOptions, RATES_HZ,
+    Source, TextLayout)
 from .names import bare_name, COUNTERS, READING, TICKS, unit_of, UNITS
 from ..errors import InputError
 from ..finding import Finding
@@ -193,7 +195,7 @@ def _stated_clock(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
     rate = f' ({1.0 / step:.3g} Hz)' if step > 0.0 else ''
     words = f'{named} in {unit}{rate}{"" if unit == "s" else " -> s"}'
     agrees = not layout.rate_hz or not step > 0.0 or any(
-        1.0 / _AGREES < 1.0 / step / each < _AGREES for each in rates_beside(layout, source))
+        1.0 / _AGREES < 1.0 / step / each < _AGREES for each in _rates_beside(layout, source))
     doubts = () if agrees else (f'{source.name} has {1.0 / step:.4g} samples per second, but the '
                                 f'file states {layout.rate_hz:g} Hz',)
     return Clock(columns, scale, _PERIODS_S.get(unit, ()), words, doubts)
@@ -225,7 +227,7 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
             return 's'
     # A unit with a plausible rate, best one that the file states; else s.
     units = TICKS.get(bare_name(source.name), _UNITS)
-    beside = rates_beside(layout, source)
+    beside = _rates_beside(layout, source)
     if not step > 0.0:
         return 's'
     rates = {name: 1.0 / (step * unit) for name, unit in units.items()}
@@ -248,6 +250,19 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
                      if change * rates[name] <= _FASTEST * len(stamps)] or plausible
     return min(agreeing or since_1970 or plausible, default='s',
                key=lambda name: abs(math.log(rates[name] / usual)))
+
+
+def _rates_beside(layout: TextLayout, time: Source) -> list[float]:
+    """Return the rates of the rows that the file states [Hz]: in words, or by another clock."""
+    rates = []
+    counted = counter_of(layout)
+    if layout.rate_hz is not None:
+        rates.append(layout.rate_hz / (layout.step(counted.index) if counted else 1.0))
+    for k, known in columns_named('time', layout.header).items():
+        unit, step = unit_of('time', known.unit), layout.step(k)
+        if unit is not None and k != time.index and step > 0.0:
+            rates.append(1.0 / (unit[1] * step))
+    return rates
 
 
 def _step_of(stamps: Floats) -> float:

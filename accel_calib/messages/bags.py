@@ -20,7 +20,7 @@ import os
 from pathlib import Path
 import shutil
 import sqlite3
-from tempfile import mkdtemp
+from tempfile import TemporaryDirectory
 import time
 from typing import Any
 
@@ -31,8 +31,8 @@ from ..calibration import Calibration, on_topics
 from ..disk import check_regular
 from ..errors import InputError
 from ..logs import (
-    BAG, doubles_at, IMU_DOUBLES, imus_of, joined, LogOptions, Messages, messages_of, open_bag,
-    parts_of, Progress, put_doubles, renamed)
+    BAG, doubles_at, IMU_DOUBLES, imus_of, joined, LogOptions, messages_of, open_bag, parts_of,
+    Progress, rewritten)
 from ..pipeline import Correction
 from ..table import check_units, Recording
 from ..units import Units, units_of
@@ -117,16 +117,14 @@ def _new(out: Path) -> Iterator[Path]:
     for each in out.parent.glob(f'.{glob.escape(out.name)}.*{_PARTIAL}'):
         if not each.is_symlink() and time.time() - each.stat().st_mtime > _STALE_S:
             shutil.rmtree(each)
-    folder = Path(mkdtemp(_PARTIAL, f'.{out.name}.', out.parent))
     try:
-        yield folder
+        with TemporaryDirectory(_PARTIAL, f'.{out.name}.', out.parent) as folder:
+            yield Path(folder)
     except sqlite3.OperationalError as err:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(out)) from err
     except OSError as err:
         err.filename = str(out)
         raise
-    finally:
-        shutil.rmtree(folder)
 
 
 @dataclass
@@ -141,8 +139,8 @@ class _Imus:
     scale: float
     done: int = 0
 
-    def corrected(self, raws: Sequence[memoryview]) -> Messages:
-        """Return corrected messages in a new buffer."""
+    def corrected(self, raws: Sequence[memoryview]) -> Iterator[bytes]:
+        """Return the corrected messages."""
         own, sensor = self.correction.calibration, self.known['sensor']
         name = f'{self.path}, {self.known["topic"]}'
         messages = joined(raws, IMU_DOUBLES, name, ros2=self.ros2, before=self.done)
@@ -155,9 +153,9 @@ class _Imus:
             for key, track in self.known['tracks'].items()}))
         doubles = doubles_at(messages, slice(0, IMU_DOUBLES))
         with np.errstate(over='ignore', invalid='ignore'):  # damaged numbers become infinite
-            put_doubles(messages, corrected(own, doubles, known, scale=self.scale))
+            new = corrected(own, doubles, known, scale=self.scale)
         self.done += len(messages)
-        return renamed(messages, output_frame(own, sensor)) if own.is_levelled else messages
+        return rewritten(messages, new, output_frame(own, sensor) if own.is_levelled else None)
 
 
 def _copy(imus: _Imus, parts: Iterator[Any], folder: Path, out: Path, progress: Progress
@@ -176,7 +174,7 @@ def _copy(imus: _Imus, parts: Iterator[Any], folder: Path, out: Path, progress: 
             raws = [block['data'].data[start:end] for start, end in zip([0, *ends], ends)]
             connections = block['connection'].tolist()
             which = [k for k, connection in enumerate(connections) if connection in imu]
-            new = imus.corrected([raws[k] for k in which]).each() if which else ()
+            new = imus.corrected([raws[k] for k in which]) if which else ()
             changed = dict(zip(which, new, strict=True))
             for k, (connection, stamp) in enumerate(zip(connections, block['stamp'].tolist())):
                 writer.write(outputs[connection], stamp, changed.get(k, raws[k]))

@@ -35,9 +35,8 @@ Covariances rarely change from message to message, so that each is transformed o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from itertools import repeat
 import math
 from operator import add
 import struct
@@ -163,53 +162,37 @@ class OneReading:
         self.turn: Matrix = (model.rotation.T * unit).ravel().tolist()
         self.back: Matrix = (model.rotation / unit).ravel().tolist()
         self.per_g = calibration.units.per_g
-        self._fixed = [0.0] * 12
-        self._bends: list[_Bend] = []
-        self._varying: list[tuple[Effect, list[float], list[_Term]]] = []
+        self._effects: list[tuple[Effect, list[float], list[_Term]]] = []
         self.of_force: list[tuple[Effect, list[float], list[_Term]]] = []
         for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
             size, shape = effect.split(values)
             terms = [(each.axis, each.monomial, each.weight * float(size[each.parameter]))
                      for each in effect.terms]
-            if effect.factor is not None:
-                kept = self.of_force if effect.of_force else self._varying
-                kept.append((effect, shape.tolist(), terms))
-            else:
-                self._add(terms, repeat(1.0), self._fixed, self._bends)
-        self._varying.sort(key=lambda each: each[0].scales)
+            kept = self.of_force if effect.of_force else self._effects
+            kept.append((effect, shape.tolist(), terms))
+        self._effects.sort(key=lambda each: each[0].scales)  # last, when all gains are there
         used = model.terms.monomials
         self.monomials = (*range(AFFINE), *(index for index in used if index >= AFFINE))
-        self._fixed_at = (None if self._varying or self.of_force
-                          else AtReading(self, self._fixed, self._bends, {}))
-
-    def _add(self, terms: list[_Term], factors: Iterable[float], affine: list[float],
-             bends: list[_Bend]) -> None:
-        """Add terms to V and W - I, row by row, and to the bending terms."""
-        for (axis, monomial, size), factor in zip(terms, factors):
-            size *= factor
-            if monomial == ONE:
-                affine[axis] += size
-            elif monomial < AFFINE:
-                affine[3 + 3 * axis + monomial - FORCE] += size
-            else:
-                value, gradient = MONOMIALS[monomial]
-                bends.append((axis, size, value, gradient))
 
     def at(self, known: Known) -> AtReading:
         """Return the calibration at a context; a quantity that is missing is an InputError."""
-        if self._fixed_at is not None:
-            return self._fixed_at
         check_context(self._calibration.model, known)
         ranges = self._calibration.ranges
         if ranges:  # effects are not extrapolated
             known = {**known, **{key: min(max(known[key], low), high)
                                  for key, (low, high) in ranges.items() if key in known}}
-        affine, bends = list(self._fixed), list(self._bends)
-        for effect, shape, terms in self._varying:
+        affine, bends = [0.0] * 12, list[_Bend]()  # V and W - I, row by row, and bending terms
+        for effect, shape, terms in self._effects:
             factors = _factors(effect, known, shape, terms)
-            if effect.scales:  # all other gains are there
+            if effect.scales:
                 affine[3:] = [part * (1.0 + terms[0][2] * factors[0]) for part in affine[3:]]
-            self._add(terms, factors, affine, bends)
+            for (axis, monomial, size), factor in zip(terms, factors):
+                if monomial == ONE:
+                    affine[axis] += size * factor
+                elif monomial < AFFINE:
+                    affine[3 + 3 * axis + monomial - FORCE] += size * factor
+                else:
+                    bends.append((axis, size * factor, *MONOMIALS[monomial]))
         return AtReading(self, affine, bends, known)
 
     @cached_property
@@ -446,7 +429,6 @@ class Rewriter:
         self._per_message = bool({'time', 'rate'}.intersection(self._needs))
         self._at = None if self._needs else self._calibration.at({})
         self._context: Mapping[str, float] | None = None
-        self._around: list[float | None] = []
         self._largest = LARGEST_G * gravity
         self._given, self.layout = layout, layout_with(frame_id)
         self._renamed = self.layout.name != layout.name
@@ -513,10 +495,7 @@ class Rewriter:
     def _at_context(self, data: bytes, front: Sequence[Any], context: Mapping[str, float]
                     ) -> AtReading:
         """Return the calibration at the context of a message, and cache it."""
-        around = [context.get(key) for key in self._needs]
-        same, self._context, self._around = around == self._around, context, around
-        if self._at is not None and same and not self._per_message:
-            return self._at
+        self._context = context
         seconds, nanoseconds = STAMP.unpack_from(data, STAMP_AT)
         rate, absent = tuple(front[5:8]), front[8][:8] == _ABSENT
         time = seconds + nanoseconds * 1e-9

@@ -10,7 +10,7 @@ from typing import Any
 
 import accel_calib as ac
 from accel_calib.calibration import Calibration, fit_poses, level, SampleNoise
-from accel_calib.logs import doubles_at, joined, layout_of, renamed, samples_of
+from accel_calib.logs import doubles_at, joined, layout_of, rewritten, samples_of
 from accel_calib.messages import corrected, motion_of, output_frame, Rewriter
 from accel_calib.session import diagnostics, progress
 from accel_calib.units import units_of
@@ -132,7 +132,8 @@ def messages() -> Any:
             'single': single, 'together': corrected(calibration, doubles_at(every, slice(0, 37)),
                                                     known), 'layout': layout, 'frame': to,
             'ids': frame_ids(every), 'samples': samples_of(every), 'renamed': [
-                bytes(each)[:48] for each in renamed(every, 'other').each()][:2],
+                each[:48] for each in rewritten(
+                    every, doubles_at(every, slice(0, 37)), 'other')][:2],
             'motion': motion_of(raws[0], layout, np.array([0.1, 0.2, 9.8]))[-32:], 'large': [
                 isinstance(attempt(write, each, {'temperature': 20.0}), bytes) for each in large]}
     raw = next(_messages('imu', 1))
@@ -143,7 +144,8 @@ def messages() -> Any:
     for name, raws, ros2 in (('big endian', [raw, swapped], True), ('ROS 1', [ros1], False)):
         made = joined(raws, 37, 'imu', ros2=ros2)
         found[name] = [stamps_of(made), doubles_at(made, slice(25, 28)), frame_ids(made),
-                       [bytes(each)[:40] for each in renamed(made, 'longer_name').each()]]
+                       [each[:40] for each in rewritten(
+                           made, doubles_at(made, slice(0, 37)), 'longer_name')]]
     found['layouts'] = [layout_with(each) for each in ('', 'imu', 'imu_link', 'übung')]
     found['damaged'] = [layout_of(each) is None for each in (
         raw, raw[:-1], raw + b'\0', b'\0\0' + raw[2:], raw[:12] + b'\0' + raw[13:], raw[:20])]
