@@ -9,6 +9,7 @@ the variable IMU_MESSAGES, 800 by default.
 
 """
 
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import product
 import math
@@ -310,6 +311,15 @@ def test_context_of_one_reading_is_limited_to_the_ranges():
         context = {'temperature': np.array([temperature])}
         np.testing.assert_allclose(beyond, calibration.correct(np.array([[1.0, 2.0, 9.0]]),
                                                                context)[0], atol=1e-12)
+
+
+def test_each_message_without_its_context_is_refused():
+    calibration = calibration_of({'offset_temperature': [2e-3, -1e-3, 1e-3]})
+    data, lacking = message(fields_of(1)), {'supply_voltage': 3.3}
+    rewriter = rewriter_of(data, calibration)
+    for context in ({'temperature': 30.0}, lacking, lacking, {'temperature': 31.0}):
+        with pytest.raises(InputError) if context is lacking else nullcontext():
+            rewriter(data, context)
 
 
 def test_effects_too_large_to_be_corrected_are_refused():

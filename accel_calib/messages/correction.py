@@ -495,7 +495,6 @@ class Rewriter:
     def _at_context(self, data: bytes, front: Sequence[Any], context: Mapping[str, float]
                     ) -> AtReading:
         """Return the calibration at the context of a message, and cache it."""
-        self._context = context
         seconds, nanoseconds = STAMP.unpack_from(data, STAMP_AT)
         rate, absent = tuple(front[5:8]), front[8][:8] == _ABSENT
         time = seconds + nanoseconds * 1e-9
@@ -505,7 +504,7 @@ class Rewriter:
         if self._thermal is not None and 'temperature' in context:
             self._thermal.add(time, context['temperature'])
             known.update(self._thermal.value)
-        self._at = self._calibration.at(known)
+        self._at, self._context = self._calibration.at(known), context
         return self._at
 
 
