@@ -398,7 +398,7 @@ def _less(found: Found, names: Collection[EffectKey]) -> Found | None:
     state = found.final.refit_without(names) if names else None
     if state is None:
         return None
-    near = replace(found.near, walk=None, chosen=found.near.beside.without_effects(names))
+    near = replace(found.near, walk=None, chosen=found.near.beside.without(*names))
     fewer = replace(found, final=state, near=near)
     return fewer if found.walk is None else _walking(fewer) or fewer
 
