@@ -272,30 +272,23 @@ def _search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
         beside = settle(begun, poses_g, fixed, (*names, *products))
         if not {*products}.isdisjoint(beside[1].names):
             state, near, trial = beside
-    begun = fit_without(begun, poses_g, near.chosen.out)
-    taken_back: tuple[EffectKey, ...] = ()
-    share = 1.0 - (state.rss - state.dof) / max(begun.rss - begun.dof, 1e-300)
-    explains = not state.fit.noise_known or state.is_noise or share >= _LEAST_SHARE
-    if near.names and near.walk is None and not explains:
-        taken_back, state = near.names, begun
-        near = replace(near, chosen=near.chosen.instead(()))
-    out = near.chosen.out
+    out, begun = near.chosen.out, fit_without(begun, poses_g, near.chosen.out)
     first = fit_without(start, poses_g, out) if out else start
-    found = Found(first, state, np.array(out, np.intp), near, taken_back=taken_back)
-    found = _described(_without_chance(found), start, poses_g)
+    found = Found(first, state, np.array(out, np.intp), near)
+    share = 1.0 - (state.rss - state.dof) / max(begun.rss - begun.dof, 1e-300)
+    if near.names and near.walk is None and not state.is_noise and share < _LEAST_SHARE:
+        found = replace(found, final=begun, taken_back=near.names,
+                        near=replace(near, chosen=near.chosen.instead(())))
+    chance = tuple(name for name in found.near.names if _is_coincidence(found, name))
+    fewer = _less(found, chance)
+    found = found if fewer is None else replace(fewer, taken_back=chance)
+    found = _described(found, start, poses_g)
     state, near = make_sound(found.final, found.near, trial, found.base.model, ladder)
     there = {*state.model.values, *included(state.model.values), WANDER} - _of_a_turn(state)
     beyond = (*ladder, *near.names, *(() if found.curve is None else (found.curve.name,)),
               *(() if near.walk is None else (WANDER,)))
     return replace(found, final=state, near=near,
                    added=tuple(name for name in beyond if name in there))
-
-
-def _without_chance(found: Found) -> Found:
-    """Return what was found, without the effects that are a coincidence."""
-    chance = tuple(name for name in found.near.names if _is_coincidence(found, name))
-    fewer = _less(found, chance)
-    return found if fewer is None else replace(fewer, taken_back=chance)
 
 
 def _is_coincidence(found: Found, name: EffectKey) -> bool:
