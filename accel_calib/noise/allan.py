@@ -78,8 +78,7 @@ from numpy.typing import NDArray
 import scipy
 
 from ..errors import InputError
-from ..statistics import rms
-from ..units import Floats
+from ..units import Floats, rms
 
 FLAT = 2.0 * np.log(2.0) / np.pi
 """Allan variance of flicker noise in units of B²."""

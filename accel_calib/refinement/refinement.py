@@ -45,9 +45,11 @@ from ..calibration import (
     quality_of, record_of, refuse_if_unfit, Rejected, rejected_by, sound_rows, sure_rows,
     uncertainty_g, with_rest_noise)
 from ..effects import (
-    add_history, EffectKey, Model, MODELS, OwnEffect, PROCESSES, unchanged, with_vector)
+    add_history, covariance_of_steps, EffectKey, Model, MODELS, OwnEffect, PROCESSES, unchanged,
+    with_vector)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
-from ..estimate import estimate, fit_sphere, judge, NotConvergedError, outliers, variance_factor
+from ..estimate import (
+    estimate, fit_sphere, judge, NotConvergedError, originals, outliers, variance_factor)
 from ..finding import explained_by, Finding, has, without as without_kinds
 from ..geometry import unit
 from ..table import check_units, Floats, Poses, Record
@@ -69,6 +71,9 @@ _NAMED = 4
 _LEAST_CHECKS = 4
 """Smallest number of equations beyond values with which a refinement is used. With fewer, of 12
 simulated poses, a wrong effect explains as much as the true one, and new poses read worse."""
+
+_WARMER = 1e-3
+"""Difference of temperature for the slope of a reading [°C]."""
 
 _SAME = 0.999
 """Quantile of chi² below which a stored calibration agrees with poses of its fit."""
@@ -225,6 +230,8 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
                               f'{_LEAST_POSES} to find an effect', 'take 24 poses or more')
     stored = base if isinstance(base, Calibration) else None
     calibration = stored or base_of(poses, units, str(base))
+    # Copies would count as further evidence, and leave nothing unseen that is held out.
+    sound = sound.take(np.unique(originals(in_g(sound, calibration.units))))
 
     def at(model: Model) -> Poses:
         known = add_history(in_g(sound, calibration.units), model)
@@ -281,9 +288,34 @@ def _is_same_way(model: Model, *ways: Poses) -> bool:
     return bool(np.max(np.abs(one - other), initial=0.0) < 1e-5)
 
 
+def _with_steps(final: State, poses: Poses) -> State:
+    """
+    Return a state with what a thermometer with steps adds to its covariance.
+
+    To first order, the errors dT of the temperatures at the poses move the values by
+    -J⁺ (∂reading/∂T dT), with J the derivative of the equations.
+
+    """
+    fit, model = final.fit.beside or final.fit, final.model
+    if not {'time', 'temperature'} <= {*poses.columns} or 'temperature' not in model.over:
+        return final
+    context, near = fit.context, fit.equations
+    warmer = {**context, 'temperature': context['temperature'] + _WARMER}
+    slope = np.nan_to_num(model.at(warmer).reading(near.force)
+                          - model.at(context).reading(near.force)) / _WARMER
+    rows = np.sum(near.columns(Model({'offset': np.zeros(3)})) * slope[near.pose], axis=1)
+    onto, order = np.zeros((len(poses), fit.columns.shape[1])), np.argsort(poses.row)
+    place = np.searchsorted(poses.row, fit.poses_g.row[near.pose], sorter=order)
+    own = place < len(poses)  # not the poses of a stored calibration
+    np.add.at(onto, order[place[own]], (np.linalg.pinv(fit.columns) * rows).T[own])
+    spread = covariance_of_steps(poses['time'], poses['temperature'], onto.T)
+    return State(replace(final.fit, of_context=fit.ties @ spread @ fit.ties.T))
+
+
 def _conclude(calibration: Calibration, found: Found, given: Given) -> Refinement:
     """Return the refinement of a calibration by what a search has found."""
-    start, final = found.base, found.final
+    start, final = found.base, _with_steps(found.final, given.poses)
+    found = replace(found, final=final)
     if given.stored:  # as stored, without a fit
         kept = calibration.held(start.poses_g)
         start = State(judge(Model(calibration.model.values), kept))
@@ -460,7 +492,7 @@ def refitted(before: Calibration, poses: Poses, *, sensor: str = '', date: str =
     out = [Rejected(int(row), 'outlier', 'outlier') for row in poses_g.row
            if row not in final.poses_g.row]
     given = Given(poses, poses_g, stored=True, rejected=(*doubts, *unsound, *out), notes=())
-    calibration, refusal = refined_calibration(before, final, (), given)
+    calibration, refusal = refined_calibration(before, _with_steps(final, poses), (), given)
     if refusal:
         raise RefusedFitError(*refusal)
     return replace(calibration, reason=before.reason, sensor=sensor or before.sensor, date=date)

@@ -36,9 +36,8 @@ from ..effects import (
     unchanged, variable_of, WANDER)
 from ..estimate import Fit, kinds
 from ..geometry import ATTITUDES
-from ..statistics import rms
 from ..table import column_of, Floats, Poses
-from ..units import MG
+from ..units import MG, rms
 
 MOST_RIVALS = 3
 """Largest number of rivals of an effect that is called the explanation."""

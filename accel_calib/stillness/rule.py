@@ -58,9 +58,8 @@ from numpy.typing import NDArray
 
 from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records
 from .trend import oscillation, sliding, Stretch, stretch, window_figures
-from ..statistics import rms
 from ..table import Floats
-from ..units import Units
+from ..units import rms, Units
 
 LONG = 12
 """Number of chunks from which the noise is estimated."""
