@@ -18,8 +18,8 @@ final model, and removes or exchanges them.
 **Rivals** are effects that would explain the data about as well as a named one. The probability of
 an effect against its rivals follows from the score of the set with each of them in its place,
 exp(c score / 2), all else being equal (Kass and Raftery 1995), with the preference of the search
-for fewer values (`AS_GOOD`). The noise is estimated from the same equations, so
-differences are less certain: c is the share of the degrees of freedom that the set leaves.
+for fewer values (`AS_GOOD`). The noise is estimated from the same equations, so differences are
+less certain: c is the share of the degrees of freedom that the set leaves.
 
 """
 
