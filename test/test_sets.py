@@ -118,7 +118,7 @@ def test_the_score_counts_values_shapes_choice_and_size():
     residual = np.zeros(40)
     residual[:3] = 6.0, 8.0, 2.0
     columns = np.eye(40)[:, :2]
-    linear = by_hand(residual, columns, ['supply_ratio', 'supply_ratio'], choice=3.0, tried=5.0)
+    linear = by_hand(residual, columns, ['supply_ratio', 'quadratic'], choice=3.0, tried=5.0)
     one, both = Set.of(linear, (0,)), Set.of(linear, (0, 1))
 
     def expected(rss, values, charge):
@@ -130,7 +130,7 @@ def test_the_score_counts_values_shapes_choice_and_size():
     assert one.score == pytest.approx(expected(68.0, 1.0, 3.0 + 2.0 * math.log(5.0)))
     assert both.score == pytest.approx(expected(4.0, 2.0, 2.0 * (3.0 + 2.0 * math.log(5.0))))
     assert one.scores_beside[1] == pytest.approx(both.score)
-    assert [both.without(block).blocks for block in both.blocks] == [(1,), (0,)]
+    assert [both.without(effect).blocks for effect in both.effects] == [(1,), (0,)]
     left_out = Set.of(linear, (), (0, 1))
     assert left_out.score == pytest.approx(expected(4.0, 2.0, 2.0 * (2.0 * math.log(40.0) + RARE)))
 
@@ -180,7 +180,7 @@ def test_noise_alone_is_significant_as_often_as_stated():
     for seed in range(600):
         residual = np.random.default_rng(seed).normal(size=30)
         linear = by_hand(residual, np.eye(30)[:, :4], names)
-        best.append(min(Set.of(linear, (k,)).probability(k) for k in range(4)))
+        best.append(min(Set.of(linear, (k,)).probability(names[k]) for k in range(4)))
     assert np.mean(np.array(best) < 0.1) == pytest.approx(0.1, abs=0.03)
     assert np.mean(np.array(best) < REFINE_LEVEL) == pytest.approx(REFINE_LEVEL, abs=0.009)
 
@@ -195,10 +195,10 @@ def test_two_effects_are_found_where_neither_alone_is_significant():
         poses_of(hidden, time=time, temperature=warm), *{*EFFECTS} - {'offset_temperature_cubic'})
     for block, each in enumerate(linear.blocks):
         if each.effect in hidden:
-            assert Set.of(linear, (block,)).probability(block) > REFINE_LEVEL
+            assert Set.of(linear, (block,)).probability(each.effect) > REFINE_LEVEL
     best = next(accepted(explored(linear)))
     assert set(best.effects) == set(hidden)
-    assert all(best.probability(block) < REFINE_LEVEL for block in best.blocks)
+    assert all(best.probability(name) < REFINE_LEVEL for name in best.effects)
 
 
 @pytest.mark.parametrize(('hidden', 'knocked', 'tried'), [
@@ -237,9 +237,9 @@ def test_of_sets_that_are_almost_as_good_the_one_with_fewest_values_is_preferred
 def test_an_effect_that_explains_all_of_a_gap_needs_less(noise, size, probability, is_accepted):
     residual = np.array([size, *np.full(39, noise)])
     alone = Set.of(by_hand(residual, np.eye(40)[:, :1], ['quadratic']), (0,))
-    tried = probability / alone.probability(0)
+    tried = probability / alone.probability('quadratic')
     chosen = Set.of(by_hand(residual, np.eye(40)[:, :1], ['quadratic'], tried=tried), (0,))
-    assert chosen.probability(0) == pytest.approx(probability)
+    assert chosen.probability('quadratic') == pytest.approx(probability)
     assert list(accepted([chosen])) == [chosen] * is_accepted
 
 

@@ -169,13 +169,14 @@ class Spread:
     """
     Covariances of the estimates at all k lengths, for any sizes of the components.
 
-    For p pairs of lengths i <= j, `gamma` (p, 4, g) is the covariance of the differences at each
-    lag, for each component of size 1, and `weight` (p, g) is the weight of the square at each lag.
-    `of_mean` (4, k, k) is the covariance of the mean differences times m_i m_j, for each
+    For the p `pairs` of lengths i <= j, `gamma` (p, 4, g) is the covariance of the differences at
+    each lag, for each component of size 1, and `weight` (p, g) is the weight of the square at each
+    lag. `of_mean` (4, k, k) is the covariance of the mean differences times m_i m_j, for each
     component of size 1.
 
     """
 
+    pairs: tuple[NDArray[np.intp], NDArray[np.intp]]
     gamma: Floats
     weight: Floats
     of_mean: Floats
@@ -185,8 +186,7 @@ class Spread:
         used = np.flatnonzero(sizes[:_RANDOM])
         gamma = np.einsum('c,pcg->pg', sizes[used], self.gamma[:, used])
         matrix = np.zeros(self.of_mean.shape[1:])
-        pairs = np.triu_indices(len(matrix))
-        matrix[pairs] = matrix.T[pairs] = np.einsum('pg,pg->p', self.weight, gamma**2)
+        matrix[self.pairs] = matrix.T[self.pairs] = np.einsum('pg,pg->p', self.weight, gamma**2)
         if sizes[_RANDOM] > 0.0:
             # Without the negative eigenvalues of rounded sums.
             values, vectors = np.linalg.eigh(np.einsum('c,cij->ij', sizes[:_RANDOM], self.of_mean))
@@ -218,7 +218,7 @@ def spread_of(lengths: Counts, samples: int) -> Spread:
     of_mean[:, first, second] = 0.5 * np.einsum('pg,pcg->cp', weight, gamma) * (
         lengths[first] * lengths[second])
     of_mean[:, second, first] = of_mean[:, first, second]
-    return Spread(gamma, weight, of_mean)
+    return Spread((first, second), gamma, weight, of_mean)
 
 
 def _between(lag: Counts, one: int, two: int) -> Floats:

@@ -43,7 +43,7 @@ again, and `with_outliers` finds their outliers: the steps of the search in `.se
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate, groupby
@@ -305,17 +305,14 @@ class Set:
         """Return the same set in other equations with the same candidates."""
         return Set.of(linear, self.blocks, self.out)
 
-    def without(self, block: int) -> Set:
-        return self.instead(other for other in self.blocks if other != block)
+    def without(self, *effects: EffectKey) -> Set:
+        return self.instead(block for block in self.blocks
+                            if self.linear.blocks[block].effect not in effects)
 
     @property
     def smaller(self) -> list[Set]:
         """Return a set of several effects without each of them."""
-        return [self.without(block) for block in self.blocks if len(self.blocks) > 1]
-
-    def without_effects(self, effects: Collection[EffectKey]) -> Set:
-        return self.instead(block for block in self.blocks
-                            if self.linear.blocks[block].effect not in effects)
+        return [self.without(effect) for effect in self.effects if len(self.blocks) > 1]
 
     @cached_property
     def rss(self) -> float:
@@ -422,10 +419,10 @@ class Set:
                                    self.charge + cost)
         return np.where(rank > 0.0, scores, -np.inf)
 
-    def probability(self, block: int) -> float:
-        """Return the probability that noise alone makes a block this good beside the others."""
-        chance = self.chance(self.without(block))
-        return min(1.0, chance * self.linear.kinds * self.linear.blocks[block].tried)
+    def probability(self, effect: EffectKey) -> float:
+        """Return the probability that noise alone makes an effect this good beside the others."""
+        chance, own = self.chance(self.without(effect)), self.entries[self.effects.index(effect)]
+        return min(1.0, chance * self.linear.kinds * own.tried)
 
     @property
     def left(self) -> float:

@@ -4,13 +4,7 @@
 """
 The refinement of a calibration: from poses and a base to the record of the result.
 
-See `.search` for the method.
-
-**Stored calibration as the base.** The calibration is the simulation, and the new poses are the
-measurement. The poses of the calibration are added to the new poses, without their times, because
-the clocks of two recordings can differ. If the file was edited by hand, or the new poses are
-partly those of the calibration and contradict it, the readings that the calibration predicts
-replace its measured ones.
+See `.search` for the method, and for a stored calibration as the base.
 
 **Typical values of a fleet.** The search for effects is that without a fleet, because a fleet says
 nothing about effects beyond offset, gain and cross-axis. It needs more poses than model 10 has
@@ -31,10 +25,8 @@ from html import escape
 from importlib import import_module
 
 import numpy as np
-from numpy.typing import NDArray
-import scipy
 
-from .search import Found, sampled, search, with_changes
+from .search import beside_stored, Found, join_rows, sampled, search, with_changes
 from .state import fitted_state, is_noise, State
 from .steps import (
     find_rivals, not_testable, Remark, remarks_on, Stage, Step, steps_of, untestable, Verdict,
@@ -48,9 +40,8 @@ from ..effects import (
     add_history, covariance_of_steps, EffectKey, Model, MODELS, OwnEffect, PROCESSES, unchanged,
     with_vector)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
-from ..estimate import (
-    estimate, fit_sphere, judge, NotConvergedError, originals, outliers, variance_factor)
-from ..finding import explained_by, Finding, has, without as without_kinds
+from ..estimate import fit_sphere, judge, NotConvergedError, originals, outliers, variance_factor
+from ..finding import explained_by, Finding, without as without_kinds
 from ..geometry import unit
 from ..table import check_units, Floats, Poses, Record
 from ..text import counted, table
@@ -74,9 +65,6 @@ simulated poses, a wrong effect explains as much as the true one, and new poses 
 
 _WARMER = 1e-3
 """Difference of temperature for the slope of a reading [°C]."""
-
-_SAME = 0.999
-"""Quantile of chi² below which a stored calibration agrees with poses of its fit."""
 
 _BASE = '10'
 _ORIENTATION = ('reference', 'orientation')
@@ -506,7 +494,7 @@ def refined_calibration(base: Calibration, final: State, added: tuple[EffectKey,
     if 'new' in kept:  # beside the poses of the stored calibration
         if final.model.effects == model.effects and all(key in base.poses for key in model.needs):
             stored = base.used_poses
-            poses = replace(poses, row=_rows(poses, stored), columns={
+            poses = replace(poses, row=join_rows(poses, stored), columns={
                 key: np.concatenate([values, stored[key]])
                 for key, values in poses.columns.items() if key in stored})
         else:
@@ -553,50 +541,3 @@ def _determined(refined: Calibration, final: State) -> tuple[Calibration, tuple[
                          TAKE_ALL_SIDES)
     own = without_kinds(fit_findings(fit, dilution), 'beyond_noise')  # the verdict states it
     return replace(refined, noted=(*refined.noted, *own)), ()
-
-
-def beside_stored(poses_g: Poses, calibration: Calibration, model: Model) -> Poses:
-    """
-    Return new poses in g followed by those of a stored calibration, with the column ``new``.
-
-    The ways between the poses of the calibration are those that `model` corrects.
-    Return only the new poses, without this column, if the calibration has no effects or no poses,
-    or was fitted to some of the new poses and still agrees with them.
-
-    """
-    stored = add_history(in_g(calibration.poses, calibration.units), model)
-    stored = stored.take(np.isin(stored.row, calibration.used_poses.row))
-    if not len(stored) or not calibration.model.effects:
-        return poses_g
-    new, old = ({tuple(row) for row in poses.reading.round(7).tolist()}  # files round
-                for poses in (poses_g, stored))
-    shared, edited = not new.isdisjoint(old), has(calibration.noted, 'edited')
-    if shared and not edited:
-        as_stored = Model(calibration.model.values)
-        fit = estimate(as_stored, poses_g)
-        excess = judge(as_stored, calibration.held(poses_g)).chi2 - fit.chi2
-        worse = max(fit.chi2 / max(fit.dof, 1), 1.0)
-        if excess / worse < scipy.special.chdtri(len(as_stored.vector), 1.0 - _SAME):
-            return poses_g  # a fit is no better than the calibration
-    if shared or edited:  # with the readings that the calibration predicts in their directions
-        here = calibration.model.at(stored.columns)
-        stored = stored.with_columns(reading=here.reading(unit(here.force(stored.reading))))
-    ours, count = {**poses_g.columns, 'new': np.ones(len(poses_g))}, len(stored)
-    optional = ('temperature', 'supply_voltage', 'rate', 'previous', *poses_g.quantities)
-    unknown = {key: np.full((count, *ours[key].shape[1:]), np.nan)
-               for key in optional if key in ours}
-    theirs = {**unknown, **stored.columns, 'new': np.zeros(count)}
-    if 'time' in calibration.ranges:  # limited to the range of the calibration
-        ours['time'] = np.clip(ours['time'], *calibration.ranges['time'])
-    elif 'time' in ours:
-        theirs['time'] = np.full(count, np.nan)
-    if 'orientation' in ours:
-        theirs['orientation'] = np.min(ours['orientation']) - 1.0 - np.arange(count)
-    columns = {key: np.concatenate([values, theirs[key]])
-               for key, values in ours.items() if key in theirs}
-    joined = Poses(columns, _rows(poses_g, stored))
-    return joined if joined.noise is not None else joined.without_columns('std', 'count')
-
-
-def _rows(poses: Poses, stored: Poses) -> NDArray[np.int64]:
-    return np.concatenate([poses.row, int(poses.row.max()) + 1 + np.arange(len(stored))])

@@ -30,6 +30,12 @@ noise that no effect explains. A pose has one equation, or three if its orientat
 shared. The sample takes one pose out of each part of the table. The place in the part changes by
 the golden ratio, so that a table that repeats the same turns gives all of them.
 
+**Stored calibration as the base.** The calibration is the simulation, and the new poses are the
+measurement. The poses of the calibration are added to the new poses, without their times, because
+the clocks of two recordings can differ. If the file was edited by hand, or the new poses are
+partly those of the calibration and contradict it, the readings that the calibration predicts
+replace its measured ones.
+
 """
 
 from __future__ import annotations
@@ -49,16 +55,23 @@ from .linear import LEVEL, Set
 from .settle import fit_without, make_sound, Near, settle
 from .state import (
     beginning, Candidate, Clipped, fitted_state, linearised, off_grid, State, unclipped, without)
+from ..calibration import Calibration, in_g
 from ..effects import (
-    CHANGES, Covariate, COVARIATES, EffectKey, EFFECTS, entry_of, factors_of, included, LADDER,
-    linear_values, Model, OwnEffect, parameter_names, unchanged, WANDER, with_vector)
-from ..estimate import beside_scatter, kinds, scatter_of, stated
+    add_history, CHANGES, Covariate, COVARIATES, EffectKey, EFFECTS, entry_of, factors_of,
+    included, LADDER, linear_values, Model, OwnEffect, parameter_names, unchanged, WANDER,
+    with_vector)
+from ..estimate import beside_scatter, estimate, judge, kinds, scatter_of, stated
+from ..finding import has
+from ..geometry import unit
 from ..table import CONTEXT, Floats, Poses
 
 MOST = 6000
 """Largest number of equations that a refinement uses."""
 
 _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
+
+_SAME = 0.999
+"""Quantile of chi² below which a stored calibration agrees with poses of its fit."""
 
 _TIMED = 30.0
 """A curve over time must have a score better than a walk by this."""
@@ -114,6 +127,54 @@ def _spread(count: int, wanted: int) -> NDArray[np.intp]:
         return np.arange(count)
     part = np.arange(wanted)
     return np.unique(((part + part * _GOLDEN % 1.0) * (count / wanted)).astype(np.intp))
+
+
+def beside_stored(poses_g: Poses, calibration: Calibration, model: Model) -> Poses:
+    """
+    Return new poses in g followed by those of a stored calibration, with the column ``new``.
+
+    The ways between the poses of the calibration are those that `model` corrects.
+    Return only the new poses, without this column, if the calibration has no effects or no poses,
+    or was fitted to some of the new poses and still agrees with them.
+
+    """
+    stored = add_history(in_g(calibration.poses, calibration.units), model)
+    stored = stored.take(np.isin(stored.row, calibration.used_poses.row))
+    if not len(stored) or not calibration.model.effects:
+        return poses_g
+    new, old = ({tuple(row) for row in poses.reading.round(7).tolist()}  # files round
+                for poses in (poses_g, stored))
+    shared, edited = not new.isdisjoint(old), has(calibration.noted, 'edited')
+    if shared and not edited:
+        as_stored = Model(calibration.model.values)
+        fit = estimate(as_stored, poses_g)
+        excess = judge(as_stored, calibration.held(poses_g)).chi2 - fit.chi2
+        worse = max(fit.chi2 / max(fit.dof, 1), 1.0)
+        if excess / worse < scipy.special.chdtri(len(as_stored.vector), 1.0 - _SAME):
+            return poses_g  # a fit is no better than the calibration
+    if shared or edited:  # with the readings that the calibration predicts in their directions
+        here = calibration.model.at(stored.columns)
+        stored = stored.with_columns(reading=here.reading(unit(here.force(stored.reading))))
+    ours, count = {**poses_g.columns, 'new': np.ones(len(poses_g))}, len(stored)
+    optional = ('temperature', 'supply_voltage', 'rate', 'previous', *poses_g.quantities)
+    unknown = {key: np.full((count, *ours[key].shape[1:]), np.nan)
+               for key in optional if key in ours}
+    theirs = {**unknown, **stored.columns, 'new': np.zeros(count)}
+    if 'time' in calibration.ranges:  # limited to the range of the calibration
+        ours['time'] = np.clip(ours['time'], *calibration.ranges['time'])
+    elif 'time' in ours:
+        theirs['time'] = np.full(count, np.nan)
+    if 'orientation' in ours:
+        theirs['orientation'] = np.min(ours['orientation']) - 1.0 - np.arange(count)
+    columns = {key: np.concatenate([values, theirs[key]])
+               for key, values in ours.items() if key in theirs}
+    joined = Poses(columns, join_rows(poses_g, stored))
+    return joined if joined.noise is not None else joined.without_columns('std', 'count')
+
+
+def join_rows(poses: Poses, stored: Poses) -> NDArray[np.int64]:
+    """Return the row numbers of poses, followed by new ones for those of a stored calibration."""
+    return np.concatenate([poses.row, int(poses.row.max()) + 1 + np.arange(len(stored))])
 
 
 @dataclass(frozen=True)
@@ -272,30 +333,23 @@ def _search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
         beside = settle(begun, poses_g, fixed, (*names, *products))
         if not {*products}.isdisjoint(beside[1].names):
             state, near, trial = beside
-    begun = fit_without(begun, poses_g, near.chosen.out)
-    taken_back: tuple[EffectKey, ...] = ()
-    share = 1.0 - (state.rss - state.dof) / max(begun.rss - begun.dof, 1e-300)
-    explains = not state.fit.noise_known or state.is_noise or share >= _LEAST_SHARE
-    if near.names and near.walk is None and not explains:
-        taken_back, state = near.names, begun
-        near = replace(near, chosen=near.chosen.instead(()))
-    out = near.chosen.out
+    out, begun = near.chosen.out, fit_without(begun, poses_g, near.chosen.out)
     first = fit_without(start, poses_g, out) if out else start
-    found = Found(first, state, np.array(out, np.intp), near, taken_back=taken_back)
-    found = _described(_without_chance(found), start, poses_g)
+    found = Found(first, state, np.array(out, np.intp), near)
+    share = 1.0 - (state.rss - state.dof) / max(begun.rss - begun.dof, 1e-300)
+    if near.names and near.walk is None and not state.is_noise and share < _LEAST_SHARE:
+        found = replace(found, final=begun, taken_back=near.names,
+                        near=replace(near, chosen=near.chosen.instead(())))
+    chance = tuple(name for name in found.near.names if _is_coincidence(found, name))
+    fewer = _less(found, chance)
+    found = found if fewer is None else replace(fewer, taken_back=chance)
+    found = _described(found, start, poses_g)
     state, near = make_sound(found.final, found.near, trial, found.base.model, ladder)
     there = {*state.model.values, *included(state.model.values), WANDER} - _of_a_turn(state)
     beyond = (*ladder, *near.names, *(() if found.curve is None else (found.curve.name,)),
               *(() if near.walk is None else (WANDER,)))
     return replace(found, final=state, near=near,
                    added=tuple(name for name in beyond if name in there))
-
-
-def _without_chance(found: Found) -> Found:
-    """Return what was found, without the effects that are a coincidence."""
-    chance = tuple(name for name in found.near.names if _is_coincidence(found, name))
-    fewer = _less(found, chance)
-    return found if fewer is None else replace(fewer, taken_back=chance)
 
 
 def _is_coincidence(found: Found, name: EffectKey) -> bool:
@@ -398,7 +452,7 @@ def _less(found: Found, names: Collection[EffectKey]) -> Found | None:
     state = found.final.refit_without(names) if names else None
     if state is None:
         return None
-    near = replace(found.near, walk=None, chosen=found.near.beside.without_effects(names))
+    near = replace(found.near, walk=None, chosen=found.near.beside.without(*names))
     fewer = replace(found, final=state, near=near)
     return fewer if found.walk is None else _walking(fewer) or fewer
 

@@ -18,8 +18,8 @@ final model, and removes or exchanges them.
 **Rivals** are effects that would explain the data about as well as a named one. The probability of
 an effect against its rivals follows from the score of the set with each of them in its place,
 exp(c score / 2), all else being equal (Kass and Raftery 1995), with the preference of the search
-for fewer values (`AS_GOOD`). The noise is estimated from the same equations, so
-differences are less certain: c is the share of the degrees of freedom that the set leaves.
+for fewer values (`AS_GOOD`). The noise is estimated from the same equations, so differences are
+less certain: c is the share of the degrees of freedom that the set leaves.
 
 """
 
@@ -126,7 +126,7 @@ def reshaped(chosen: Set) -> list[Set]:
     sets = []
     for less in chosen.smaller:
         for effect, own in fitted.items():
-            others = less.without_effects((effect,))
+            others = less.without(effect)
             if is_barred(blocks[own[0]], others.entries):
                 continue
             gain, _ = others.gains(effect)
@@ -149,7 +149,7 @@ def accepted(visited: Iterable[Set]) -> Iterator[Set]:
         for chosen in left:
             if near and chosen.score < near[0].score - AS_GOOD:
                 break
-            if all(is_significant(chosen, block) for block in chosen.blocks):
+            if all(is_significant(chosen, effect) for effect in chosen.effects):
                 near.append(chosen)
         if not near:
             return
@@ -160,7 +160,7 @@ def accepted(visited: Iterable[Set]) -> Iterator[Set]:
         left = [chosen for chosen in left if chosen is not best]
 
 
-def is_significant(chosen: Set, block: int) -> bool:
+def is_significant(chosen: Set, effect: EffectKey) -> bool:
     """
     Return whether noise alone hardly makes an effect this good beside the others of a set.
 
@@ -169,8 +169,8 @@ def is_significant(chosen: Set, block: int) -> bool:
     """
     left = chosen.linear.dof - chosen.parameters
     fills_gap = (scipy.special.chdtrc(left, chosen.rss) > _JUST_NOISE
-                 and leaves_gap(chosen.without(block)))
-    return chosen.probability(block) < (_LEVEL_OF_GAP if fills_gap else LEVEL)
+                 and leaves_gap(chosen.without(effect)))
+    return chosen.probability(effect) < (_LEVEL_OF_GAP if fills_gap else LEVEL)
 
 
 def is_all_noise(chosen: Set) -> bool:
@@ -209,14 +209,6 @@ class Near:
     def names(self) -> tuple[EffectKey, ...]:
         return self.chosen.effects
 
-    def block_of(self, name: EffectKey) -> int:
-        """Return the index of the block of a chosen effect."""
-        return self.chosen.blocks[self.names.index(name)]
-
-    def without(self, name: EffectKey) -> Set:
-        """Return what was chosen, without an effect."""
-        return self.chosen.without(self.block_of(name))
-
     def score_above(self, base_rss: float) -> float:
         """Return the score relative to a base that leaves this sum of squares."""
         worth = self.plain.worth
@@ -242,7 +234,7 @@ def probabilities(name: EffectKey, near: Near, *, usual: bool = True) -> dict[Ef
     whole = near.plain.worth + near.plain.dof
     certainty = max((whole - near.chosen.parameters) / whole, LEAST)
     back = 0.0 if usual else 1.0
-    others = near.beside if name == WANDER else near.without(name)
+    others = near.beside if name == WANDER else near.chosen.without(name)
     scores: dict[EffectKey, float] = {name: near.chosen.score + back * near.chosen.unusual}
     least = 2.0 * np.log(LEAST) / certainty + scores[name] - back * others.unusual
     for number, likely in enumerate(others.scores_beside):
@@ -406,7 +398,7 @@ def _at(linear: Linear, trial: Trial, names: tuple[EffectKey, ...], out: tuple[i
     plain = Set.of(linear, blocks, out)
     walk = walk_beside(plain, process) if walks and process is not None else None
     whole = plain if walk is None else plain.within(walk.whitened(linear))
-    blocks.sort(key=lambda block: -whole.without(block).rss)
+    blocks.sort(key=lambda block: -whole.without(linear.blocks[block].effect).rss)
     return Near(whole.instead(blocks), linear, walk, process)
 
 
@@ -432,7 +424,7 @@ def make_sound(state: State, near: Near, trial: Trial, base: Model,
         values.update((other, part) for other, part in base.values.items()
                       if other not in (*values, *included(values)))
         fewer = fitted_state(Model(values), state.poses_g)
-        if fewer is not None and not (is_significant(*ladder_set(state, name))
+        if fewer is not None and not (is_significant(ladder_set(state, name), name)
                                       and _lowers(state, fewer)):
             state = fewer
     fixed = tuple(name for name in state.model.values if name not in near.names)
@@ -452,13 +444,12 @@ def make_sound(state: State, near: Near, trial: Trial, base: Model,
     return state, near
 
 
-def ladder_set(state: State, name: EffectKey) -> tuple[Set, int]:
-    """Return the set of an effect of the ladder beside all others of a model, and its block."""
+def ladder_set(state: State, name: EffectKey) -> Set:
+    """Return the set of an effect of the ladder beside all others of a model."""
     others = tuple(other for other in state.model.effects if other != name)
     names = [other for other in LADDER if other not in others]
     linear = linearised(state.fit, others, candidates(names, state.poses_g))
-    block, = (number for number, block in enumerate(linear.blocks) if block.effect == name)
-    return Set.of(linear, (block,)), block
+    return Set.of(linear, linear.numbers_of[name].tolist())
 
 
 def _doubtful(state: State, near: Near) -> tuple[EffectKey, EffectKey] | None:
@@ -466,7 +457,7 @@ def _doubtful(state: State, near: Near) -> tuple[EffectKey, EffectKey] | None:
     for name in near.names[::-1]:  # the smallest contribution first
         if (name, '') in near.fitted:
             continue
-        if not is_significant(near.chosen, near.block_of(name)):
+        if not is_significant(near.chosen, name):
             return name, ''
         fewer = state.refit_without((name,)) if near.walk is None else None
         if fewer is not None and not _lowers(state, fewer):
@@ -486,7 +477,7 @@ def _lowers(state: State, fewer: State) -> bool:
 def _exchanged(state: State, near: Near, name: EffectKey, other: EffectKey, trial: Trial
                ) -> tuple[State, Near] | None:
     """Return the fit with another effect, if any, in the place of one, and the set near it."""
-    chosen = near.beside.without_effects((name,))
+    chosen = near.beside.without(name)
     if other and other != WANDER:
         chosen = chosen.extended(chosen.best_of(other))
     after = trial.fitted(chosen, state)

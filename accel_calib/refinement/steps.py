@@ -250,9 +250,8 @@ def _p_value(name: EffectKey, found: Found) -> float:
     if found.curve is not None and name == found.curve.name:
         return found.curve.p_value
     if name in near.names:
-        return near.chosen.probability(near.block_of(name))
-    chosen, block = ladder_set(final, name)
-    return chosen.probability(block)
+        return near.chosen.probability(name)
+    return ladder_set(final, name).probability(name)
 
 
 def _output_steps(found: Found) -> list[Step]:
@@ -470,7 +469,7 @@ def find_rivals(found: Found) -> list[dict[EffectKey, tuple[float, Fit]]]:
     """
     rivalries, near, final = [], found.near, found.final
     for name in () if near.walk is not None else near.names:
-        fits, others = {name: final.fit}, near.without(name)
+        fits, others = {name: final.fit}, near.chosen.without(name)
         kept = {key: part for key, part in final.model.values.items() if key != name}
         weights = probabilities(name, near, usual=False)
         for rival, weight in weights.items():
