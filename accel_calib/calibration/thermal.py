@@ -46,8 +46,8 @@ import scipy
 from .calibration import Calibration, PRIOR, Quality
 from .quality import finished, gated, in_g, record_of
 from ..effects import (
-    add_history, Context, EFFECTS, entry_of, factors_of, Model, OFFSET_POWERS, parameter_names,
-    REFERENCE_TEMPERATURE, sensor_force, with_vector)
+    add_history, Context, EffectKey, EFFECTS, entry_of, factors_of, Model, OFFSET_POWERS,
+    parameter_names, REFERENCE_TEMPERATURE, sensor_force, with_vector)
 from ..errors import InputError
 from ..estimate import judge
 from ..finding import Finding
@@ -87,7 +87,7 @@ as likely a bend that the effects lack."""
 _ROWS, _ROWS_OF_RATE = 24, 72
 """Number of rows that stand for a ramp among the poses of a calibration; if the rate acts."""
 
-_UNCHANGED = {_LINEAR: np.zeros(3)}
+_UNCHANGED: dict[EffectKey, Floats] = {_LINEAR: np.zeros(3)}
 """What is stored if the offset does not change."""
 
 Form = Mapping[str, Floats]
@@ -306,9 +306,8 @@ class _Board:
 
     def predicted(self, model: Model) -> Floats:
         """Return the (n, 3) offset of each stretch [g]."""
-        if not model.effects:
-            return np.zeros((len(self.levels), 3))
-        return np.concatenate([model.at(each).vec_v for each in self.contexts])
+        return np.concatenate([np.zeros_like(each['reading']) + model.at(each).vec_v
+                               for each in self.contexts])
 
     def _covariance(self, design: Floats, onto: Floats) -> Floats:
         """Return the covariance of values that are `onto`, (q, 3, n), times the readings."""
@@ -342,8 +341,6 @@ def _lagged(form: Form) -> bool:
 
 def _basis(model: Model, contexts: Sequence[Context]) -> Floats:
     """Return the (n, 3, p) derivative of the offset by all values."""
-    if not model.effects:
-        return np.zeros((sum(len(each['time']) for each in contexts), 3, 0))
     return np.concatenate([model.basis(np.zeros((len(each['time']), 3)), each).full
                            for each in contexts])
 

@@ -325,7 +325,7 @@ _SHAPE_STEP = 1e-4
 
 
 def difference(factor: Factor, context: Context, shape: Floats, place: int,
-               bounds: Sequence[tuple[float, float]] = ()) -> Floats:
+               bounds: Sequence[tuple[float, float]]) -> Floats:
     """Return the numerical derivative of a factor by one shape constant, inside its bounds."""
     low, high = bounds[place] if bounds else (-np.inf, np.inf)
     step = _SHAPE_STEP * (high - low if bounds else max(abs(shape[place]), 1.0))

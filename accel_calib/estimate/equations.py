@@ -56,7 +56,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from ..effects import Context, EachShape, EffectKey, Model, times
+from ..effects import Context, EachShape, EffectKey, Model, terms_of, times
 from ..geometry import unit
 from ..statistics import NORMAL_95, over_axes, STATED_NOISE
 from ..table import Poses
@@ -253,8 +253,8 @@ class Equations:
 
     def columns_of(self, effect: EffectKey, factors: Floats) -> Floats:
         """Return the (m, s p) derivative for s shapes; factors as from `effects.factors_of`."""
-        return np.concatenate([part.columns(EachShape(
-            effect, factors if factors.shape[2] == 1 else factors[:, :, part.which]))
+        return np.concatenate([part.columns(EachShape(terms_of((effect,)), (
+            factors if factors.shape[2] == 1 else factors[:, :, part.which])))
             for part in self.parts])
 
     def of_poses(self, residual: Floats) -> Floats:
