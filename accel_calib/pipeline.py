@@ -171,8 +171,7 @@ def _captured(source: Source, log: OpenLog, options: LogOptions, settings: Mappi
     advice = f'{more} with still_std_max {limit:.3g}'
     if not count:
         name = 'the recording' if isinstance(source, Recording) else str(source)
-        raise _nothing_still(name, found, log.units, asked, findings,
-                             finds=advice if more else '')
+        raise _nothing_still(name, found, log.units, asked, findings, finds=advice if more else '')
     lines = [f'captured {counted(count, "pose")} from {counted(found.recorded, "sample")} in '
              f'{found.seconds:.0f} s']
     if more >= 2 * count:
@@ -191,8 +190,7 @@ def _nothing_still(source: str, found: Captured, units: Units, asked: CaptureSet
         return InputError(f'{what}: {"; ".join(each.text for each in findings)}; expected at '
                           'least one', f'{findings[-1].advice}; {tried}')
     if math.isfinite(found.quietest):
-        limit = (f', the limit is {found.threshold:.2g}' if math.isfinite(found.threshold)
-                 else '')
+        limit = f', the limit is {found.threshold:.2g}' if math.isfinite(found.threshold) else ''
         what += (f': in its quietest {asked.still_window:g} s the standard deviation is '
                  f'{found.quietest:.2g} {units.name}{limit} for at least {asked.min_dwell:g} s')
     return InputError(f'{what}; expected at least one',

@@ -90,11 +90,6 @@ class LongRun:
         rounds = -(-(len(self.edges) - 1) // (6 * self.per_round))
         return rounds * self.per_round
 
-    def grown(self, name: str) -> float:
-        """Return the growth of a memory from the end of the warm-up to the end of the run [MB]."""
-        column = self.samples[name]
-        return float(column[-1] - column[self.warm])
-
     def trend(self, column: Floats) -> tuple[float, float]:
         """
         Return the slope per hour of a figure after the warm-up, and its standard error.
@@ -139,8 +134,7 @@ def take_sample(node: int, relay: int) -> dict[str, float]:
     return found
 
 
-def run_rounds(rounds: int, seconds: float, interval: float, rate: float = 1000.0, *,
-               domain: int | None = None) -> LongRun:
+def run_rounds(rounds: int, seconds: float, interval: float, rate: float) -> LongRun:
     """
     Run the node for some rounds.
 
@@ -152,8 +146,6 @@ def run_rounds(rounds: int, seconds: float, interval: float, rate: float = 1000.
         Time of a round, and between samples, of which a round has a whole number [s].
     rate : float
         Messages per second.
-    domain : int, optional
-        DDS domain; by default one of its own.
 
     """
     per_round = round(seconds / interval)
@@ -195,7 +187,7 @@ def run_rounds(rounds: int, seconds: float, interval: float, rate: float = 1000.
     trial: Trial = run_trial({
         'imu/data_calibrated': node_command('passthrough:=true'),
         'bare/data_calibrated': relay_command('serialized', 'bare/data_calibrated')},
-        rate, during, domain=domain)
+        rate, during)
     columns = {name: np.array([each[name] for each in samples[:rounds * per_round + 1]])
                for name in samples[0]}
     ours, bare = trial.heard

@@ -253,8 +253,7 @@ class Trial:
 
 
 def run_trial(programs: Mapping[str, list[str]], rate: float,
-              during: Callable[..., object], *, listened: bool = True, lead: float = 0.0,
-              domain: int | None = None) -> Trial:
+              during: Callable[..., object], *, listened: bool = True, lead: float = 0.0) -> Trial:
     """
     Run relays, or the node, between a driver and a user.
 
@@ -270,8 +269,6 @@ def run_trial(programs: Mapping[str, list[str]], rate: float,
         Whether there is a user.
     lead : float
         Time from the first message of the driver to the start of the programs [s].
-    domain : int, optional
-        DDS domain; by default one of its own.
 
     Raises
     ------
@@ -281,8 +278,8 @@ def run_trial(programs: Mapping[str, list[str]], rate: float,
     """
     with tempfile.TemporaryDirectory() as given, ExitStack() as stack:
         folder = Path(given)
-        os.environ.update(ROS_DOMAIN_ID=str(next(_DOMAINS) if domain is None else domain),
-                          PYTHONPATH=str(ROOT), ROS_LOG_DIR=given, ROS_HOME=given)
+        os.environ.update(ROS_DOMAIN_ID=str(next(_DOMAINS)), PYTHONPATH=str(ROOT),
+                          ROS_LOG_DIR=given, ROS_HOME=given)
         os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
         sent, heard, log = folder / 'sent.npy', folder / 'heard.npz', folder / 'log'
         user = stack.enter_context(process([__file__, 'listen', str(heard), *programs]

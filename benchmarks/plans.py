@@ -19,8 +19,7 @@ from accel_calib.refinement import refine, Refinement, Step
 from accel_calib.table import Floats
 from accel_calib.units import units_of
 from figures import Frame, Line, table
-from generator import Around, basis_of, plain_reading, Setup, simulate, Simulated
-from generator_effects import STANDARD_GRAVITY
+from generator import Around, measure, Setup, simulate, Simulated
 import numpy as np
 from sensors import poses_of, random_directions
 
@@ -73,23 +72,14 @@ def add_pose(made: Simulated, columns: Columns, up: Floats, temperature: float, 
         Source of the noise.
 
     """
-    setup = made.setup
+    setup = replace(made.setup, poses=1)
     sigma = setup.noise_mg * 1e-3 * setup.shaking ** rng.uniform(size=(1, 3))
     shaking = rng.normal(size=(1, 3, setup.samples)) * sigma[:, :, np.newaxis]
     elapsed, warm = columns['time'][-1:] + wait, np.array([temperature])
     around = Around(up[np.newaxis], elapsed, warm, warm, np.zeros(1), np.array([SUPPLY]),
                     rng.normal(size=(1, 3)) * 0.002, shaking, sigma)
-    reading = plain_reading(around, made.traits)
-    for name, values in made.values.items():
-        reading = reading + basis_of(name, around, made.traits) @ values
-    step = setup.step_mg * 1e-3
-    output = np.round((reading[:, :, np.newaxis] + shaking) / step) * step * STANDARD_GRAVITY
-    mean, std = np.mean(output, axis=2)[0], np.std(output, axis=2, ddof=1)[0]
-    one = {'time': elapsed, 'count': float(setup.samples), 'temperature': temperature,
-           'supply_voltage': SUPPLY, **dict(zip(('ax', 'ay', 'az'), mean)),
-           **dict(zip(('std_x', 'std_y', 'std_z'), std)),
-           **dict(zip(('gx', 'gy', 'gz'), around.rate[0]))}
-    return {name: np.append(values, one[name]) for name, values in columns.items()}
+    one = measure(rng, setup, around, made.traits, made.values)
+    return {name: np.append(values, one.columns[name]) for name, values in columns.items()}
 
 
 def add_planned(made: Simulated, columns: Columns, pose: PlannedPose, wait: float,

@@ -101,7 +101,7 @@ class Bench:
         self.node = Node('bench', context=self._context, enable_rosout=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
-        self._clients: dict[tuple[str, str, int], Any] = {}
+        self._clients: dict[tuple[str, int], Any] = {}
         self._imu: Any = None
 
     def _leave(self) -> None:
@@ -180,16 +180,15 @@ class Bench:
         self.node.create_subscription(kind, topic, heard.append, qos)
         return heard
 
-    def client(self, name: str, node: str = 'calibrator', number: int = 0) -> Any:
-        """Wait for a service of a node, and return one of its clients."""
+    def client(self, name: str, number: int = 0) -> Any:
+        """Wait for a service of the calibrator, and return one of its clients."""
         from diagnostic_msgs.srv import SelfTest
         from std_srvs.srv import SetBool, Trigger
         kind = {'enable': SetBool, 'self_test': SelfTest}.get(name, Trigger)
-        key = name, node, number
-        if key not in self._clients:
-            self._clients[key] = self.node.create_client(kind, f'{node}/{name}')
-        self.spin(self._clients[key].service_is_ready)
-        return self._clients[key]
+        if (name, number) not in self._clients:
+            self._clients[name, number] = self.node.create_client(kind, f'calibrator/{name}')
+        self.spin(self._clients[name, number].service_is_ready)
+        return self._clients[name, number]
 
     def ask(self, kind: Any, name: str, **fields: Any) -> Any:
         """Call any service, and return its answer."""

@@ -35,9 +35,8 @@ from generator_effects import (
     plain_reading, STANDARD_GRAVITY, Traits, unit)
 import numpy as np
 
-__all__ = ['again', 'Around', 'basis_of', 'EFFECTS', 'Floats', 'LEAST_CLIPPED', 'noise_in_norm',
-           'ON_OUTPUT', 'OUTSIDE', 'plain_reading', 'Setup', 'simulate', 'Simulated', 'size_of',
-           'STANDARD_GRAVITY', 'Traits', 'write_csv']
+__all__ = ['again', 'Around', 'basis_of', 'EFFECTS', 'measure', 'ON_OUTPUT', 'OUTSIDE', 'Setup',
+           'simulate', 'Simulated', 'STANDARD_GRAVITY', 'write_csv']
 
 LEAST_CLIPPED = 3
 """Smallest number of clipped poses; a single clipped pose looks like an outlier."""
@@ -167,7 +166,7 @@ def simulate(rng: np.random.Generator, hidden: Mapping[str, float] | None = None
     unknown = set(hidden) - set(values)
     if unknown:
         raise ValueError(f'hidden effects {unknown}, expected some of {list(EFFECTS)}')
-    return _measured(rng, setup, around, traits, values)
+    return measure(rng, setup, around, traits, values)
 
 
 def again(rng: np.random.Generator, before: Simulated) -> Simulated:
@@ -189,7 +188,7 @@ def again(rng: np.random.Generator, before: Simulated) -> Simulated:
                      supply=NOMINAL_SUPPLY + spread * (fresh.supply - NOMINAL_SUPPLY),
                      shaking=quiet * fresh.shaking, sigma=quiet * fresh.sigma)
     traits = replace(before.traits, scatter=rng.normal(size=(setup.poses, 3)))
-    return _measured(rng, setup, around, traits, before.values)
+    return measure(rng, setup, around, traits, before.values)
 
 
 def write_csv(path: Path, columns: Mapping[str, Floats]) -> None:
@@ -378,8 +377,8 @@ def _rail(wanted: float, values: Mapping[str, Floats], around: Around, traits: T
     return np.array([(low + high) / 2.0])
 
 
-def _measured(rng: np.random.Generator, setup: Setup, around: Around, traits: Traits,
-              values: Mapping[str, Floats]) -> Simulated:
+def measure(rng: np.random.Generator, setup: Setup, around: Around, traits: Traits,
+            values: Mapping[str, Floats]) -> Simulated:
     """Return the set of the averaged samples."""
     samples = _samples(values, around, traits)
     rows = np.sort(rng.choice(setup.poses, setup.knocked, replace=False))

@@ -40,19 +40,6 @@ def test_a_recording_becomes_a_calibration_a_page_and_a_verdict(recording, tmp_p
     assert 'GOOD' in (tmp_path / 'c.html').read_text(encoding='utf-8')
 
 
-@pytest.mark.usefixtures('without_pages')
-def test_a_hidden_effect_is_added_unless_it_is_not_wanted(tmp_path, capsys):
-    path = tmp_path / 'poses.csv'
-    run('simulate', '-o', path, '--poses', 60, *OPTIONS, '--effect',
-        'quadratic=0.004,0.003,-0.004')
-    _, found = calibrated(capsys, path, '-o', tmp_path / 'c.yaml')
-    assert 'quadratic' in read_calibration(tmp_path / 'c.yaml').model.effects
-    assert [step['effect'] for step in found['refinement']['steps']] == ['quadratic']
-    _, plain = calibrated(capsys, path, '-o', tmp_path / 'd.yaml', '--no-refine')
-    assert plain['refinement'] is None
-    assert 'quadratic' not in read_calibration(tmp_path / 'd.yaml').model.effects
-
-
 def bent(path, *, bend_mg):
     """Write poses of a sensor whose readings are far from an ellipsoid, without their noise."""
     up = random_directions(40, np.random.default_rng(5))
@@ -92,7 +79,7 @@ def test_real_logs_become_good_calibrations_without_an_option(name, tmp_path, ca
                                 '--no-refine')
     assert (status, result['rating']) == (0, 'GOOD')
     assert result['units'] == ('native' if name.startswith('xsens') else 'm/s2')
-    assert result['rms_after_mg'] < 0.3
+    assert result['rms_after_mg'] <= (0.115 if name.startswith('xsens') else 0.3)  # as imu_tk
 
 
 @pytest.mark.parametrize(('step', 'rows', 'count', 'samples'), [

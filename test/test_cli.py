@@ -11,7 +11,6 @@ import shutil
 import sys
 
 from accel_calib.stillness import CaptureSettings
-from accel_calib.stored import read_calibration
 from inside import (
     CALIBRATOR, COMMAND, COMMANDS, main, parser, rotation_from_rpy, spread_directions)
 import numpy as np
@@ -37,17 +36,6 @@ def poses(made, tmp_path):
 @pytest.fixture
 def calibration(poses, made, tmp_path):
     return Path(shutil.copy(made / 'calibration.yaml', tmp_path))
-
-
-@pytest.mark.parametrize('model', ['auto', '7', '9', '10'])
-def test_fit_reports_the_next_pose_until_more_poses_no_longer_help(model, tmp_path, capsys):
-    few, many = tmp_path / 'few.csv', tmp_path / 'many.csv'
-    run('simulate', '-o', few, '--poses', 12)
-    run('simulate', '-o', many, '--poses', 30)
-    asked = run_json(capsys, 'fit', few, '--model', model)[1]['next_pose']
-    assert np.linalg.norm(asked['direction']) == pytest.approx(1.0)
-    result = run_json(capsys, 'fit', many, '--model', model)[1]
-    assert result['next_pose'] is None
 
 
 def test_flat_row_is_levelled_even_when_it_is_not_fitted(tmp_path, capsys):
@@ -212,15 +200,6 @@ def test_a_defect_is_one_line_with_the_details_in_a_file(tmp_path, monkeypatch, 
     details, = tmp_path.glob('accel_calib-*.txt')
     assert str(details) in error
     assert 'Traceback' in details.read_text(encoding='utf-8')
-
-
-def test_a_refinement_is_stored(tmp_path):
-    poses, stored = tmp_path / 'poses.csv', tmp_path / 'refined.yaml'
-    run('simulate', '-o', poses, *OPTIONS, '--effect', 'quadratic=0.006,-0.004,0.005', '--poses',
-        60)
-    assert run('refine', poses, '-o', stored, '--sensor', 'imu_link') == 0
-    found = read_calibration(stored)
-    assert (found.sensor, 'quadratic' in found.model.effects) == ('imu_link', True)
 
 
 def test_the_report_has_a_page_and_figures(poses, tmp_path):

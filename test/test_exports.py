@@ -506,11 +506,3 @@ def test_the_command_writes_beside_the_calibration(to, stored, tmp_path, capsys)
     assert printed.out == ''
     for line in wanted.losses:
         assert line in ' '.join(printed.err.split())
-
-
-def test_the_command_writes_to_standard_output_and_its_losses_to_standard_error(stored, capfd):
-    given = stored()
-    assert run('export', given, '--to', 'px4', '-o', '-') == 0
-    printed = capfd.readouterr()
-    assert printed.out == text_of(read_calibration(given), 'px4')
-    assert re.search(r' leaves [\d.]+ mg', printed.err)

@@ -28,8 +28,8 @@ from accel_calib.stored import read_calibration, read_prior, write_calibration, 
 from accel_calib.table import Floats, Poses
 from fleet_case import page_of
 from inside import (
-    as_folder, digest, digest_of, drift_of, estimated, merge_sensor, Model, MODELS, Months,
-    not_agreeing, odd_sensors, overview, priors_of, schema, SensorValues, shared_effects,
+    as_folder, digest, digest_of, drift_of, estimated, merge_sensor, Model, MODELS, not_agreeing,
+    odd_sensors, OfModel, overview, priors_of, schema, SensorValues, shared_effects,
     simulate_poses, spread_directions, typical_of, unit, with_vector, write_fleet_page,
     write_parquet)
 import numpy as np
@@ -103,7 +103,7 @@ def test_a_value_that_is_known_badly_is_not_odd() -> None:
 
 def test_months_have_the_quantiles_of_all_calibrations() -> None:
     rng = np.random.default_rng(4)
-    months = Months(rng)
+    months = OfModel(rng)
     for _ in range(3000):
         months.add('2026-03', rng.normal(size=9))
     months.add('2026-04', np.zeros(9))  # too few to state quantiles
@@ -347,17 +347,6 @@ def test_a_damaged_file_is_refused(
 def bent(sensor: Model) -> Model:
     """Return a sensor with a nonlinearity beyond model 10."""
     return Model({**sensor.values, 'quadratic': np.array([0.012, -0.010, 0.011])})
-
-
-def test_poses_that_carry_no_search_are_refined_to_the_fit_with_the_fleet(
-        fleet: FleetPrior) -> None:
-    rng = np.random.default_rng(7)
-    poses = poses_of(bent(a_sensor(rng)), 6, rng)
-    result, fitted = refine(poses, G, base=fleet), fit_with_fleet(poses, G, fleet)
-    np.testing.assert_array_equal(result.calibration.model.vector, fitted.model.vector)
-    assert result.steps == ()
-    assert all(each in result.advice[0] for each in ('6 poses', 'at least 9'))
-    assert 'directions' in dict(result.not_testable)['quadratic']
 
 
 def test_a_refinement_with_the_fleet_finds_an_effect_beyond_it(fleet: FleetPrior) -> None:

@@ -11,6 +11,7 @@ The results of all commands and of the library are those that are stored.
 import json
 from pathlib import Path
 
+from accel_calib.finding import Finding
 from golden.cases import CASES, result_of
 from golden.record import differences, EXPECTED, text_of
 from golden.sweeps import SWEEPS
@@ -24,6 +25,25 @@ def test_the_result_is_the_one_that_is_stored(name: str, tmp_path: Path) -> None
     expected = json.loads((EXPECTED / f'{name}.json').read_text(encoding='utf-8'))
     found = list(differences(expected, json.loads(text_of(result_of(name, tmp_path)))))
     assert not found, '\n'.join([f'{len(found)} differences', *found[:MOST]])
+
+
+@pytest.mark.parametrize('name', [
+    'few', 'wrong_rows', 'without_noise', 'swapped_axes', 'rivals', 'known_knocked', 'chain',
+    'rated_effects'])
+def test_no_figure_depends_on_a_text_of_a_finding(
+        name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    checked = Finding.__post_init__
+
+    def reword(self: Finding) -> None:
+        checked(self)
+        for part in ('text', 'advice'):
+            object.__setattr__(self, part, getattr(self, part) and 'other words')
+
+    expected = json.loads((EXPECTED / f'{name}.json').read_text(encoding='utf-8'))
+    monkeypatch.setattr(Finding, '__post_init__', reword)
+    found = json.loads(text_of(result_of(name, tmp_path)))
+    assert found['words'] != expected['words']
+    assert not list(differences(expected['figures'], found['figures']))
 
 
 def test_there_is_no_result_without_a_case() -> None:

@@ -18,7 +18,7 @@ import sys
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-from accel_calib.session import CalibratorSettings, WEB_PORT
+from accel_calib.session import CalibratorSettings
 from inside import default_of
 import pytest
 from shared import table
@@ -33,61 +33,51 @@ class Context:
 
     def __init__(self, given: Mapping[str, str]) -> None:
         self.values = dict(given)
-        self.declared: dict[str, DeclareLaunchArgument] = {}
+        self.declared: dict[str, Any] = {}
 
 
-def record(name: str, *members: str, kw_only: bool = True, **methods: Any) -> Any:
+def record(name: str, *members: str, optional: Iterable[str] = (), **methods: Any) -> Any:
     """Return a class with these members, whose visit starts nothing if it is not given."""
-    return make_dataclass(name, members, kw_only=kw_only, frozen=True,
+    also = [(each, Any, field(default=None, kw_only=True)) for each in optional]
+    return make_dataclass(name, [*members, *also], frozen=True,
                           namespace={'visit': lambda self, context: [], **methods})
 
 
-LaunchConfiguration = record('LaunchConfiguration', 'name', kw_only=False,
+def declare(argument: Any, context: Context) -> list[Any]:
+    context.declared[argument.name] = argument
+    value = context.values.setdefault(argument.name, argument.default_value)
+    assert argument.choices is None or value in argument.choices
+    return []
+
+
+def include(included: Any, context: Context) -> list[Any]:
+    for name, value in included.launch_arguments or ():
+        context.values[name] = value_of(value, context)
+    return runpy.run_path(included.source)['generate_launch_description']()
+
+
+def converted(parameter: Any, context: Context) -> Any:
+    """Return a parameter in its type; of a text, launch does not convert it."""
+    text, kind = parameter.value.perform(context), parameter.value_type
+    return text.lower() == 'true' if kind is bool else kind(text)
+
+
+LaunchConfiguration = record('LaunchConfiguration', 'name',
                              perform=lambda self, context: context.values[self.name])
 OpaqueFunction = record('OpaqueFunction', 'function',
                         visit=lambda self, context: self.function(context))
-IfCondition = record('IfCondition', 'predicate', kw_only=False, evaluate=lambda self, context: {
+IfCondition = record('IfCondition', 'predicate', evaluate=lambda self, context: {
     'true': True, 'false': False}[self.predicate.perform(context).lower()])
 ChangeState = record('ChangeState', 'lifecycle_node_matcher', 'transition_id')
 EmitEvent = record('EmitEvent', 'event')
 OnStateTransition = record('OnStateTransition', 'target_lifecycle_node', 'start_state',
                            'goal_state', 'entities', 'handle_once')
-RegisterEventHandler = record('RegisterEventHandler', 'event_handler', kw_only=False)
-
-
-@dataclass(frozen=True)
-class DeclareLaunchArgument:
-    name: str
-    default_value: str | None = field(default=None, kw_only=True)
-    description: str | None = field(default=None, kw_only=True)
-    choices: list[str] | None = field(default=None, kw_only=True)
-
-    def visit(self, context: Context) -> list[Any]:
-        context.declared[self.name] = self
-        value = context.values.setdefault(self.name, self.default_value)
-        assert self.choices is None or value in self.choices
-        return []
-
-
-@dataclass(frozen=True)
-class IncludeLaunchDescription:
-    source: str
-    launch_arguments: Iterable[tuple[str, Any]] = field(default=(), kw_only=True)
-
-    def visit(self, context: Context) -> list[Any]:
-        for name, value in self.launch_arguments:
-            context.values[name] = value_of(value, context)
-        return runpy.run_path(self.source)['generate_launch_description']()
-
-
-@dataclass(frozen=True)
-class ParameterValue:
-    value: LaunchConfiguration  # of a text, launch does not convert the type
-    value_type: type = field(kw_only=True)
-
-    def perform(self, context: Context) -> Any:
-        text = self.value.perform(context)
-        return text.lower() == 'true' if self.value_type is bool else self.value_type(text)
+RegisterEventHandler = record('RegisterEventHandler', 'event_handler')
+DeclareLaunchArgument = record('DeclareLaunchArgument', 'name', optional=(
+    'default_value', 'description', 'choices'), visit=declare)
+IncludeLaunchDescription = record('IncludeLaunchDescription', 'source', optional=[
+    'launch_arguments'], visit=include)
+ParameterValue = record('ParameterValue', 'value', 'value_type', perform=converted)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -179,27 +169,25 @@ def described(file: str) -> Any:
     return runpy.run_path(str(path))['generate_launch_description']()
 
 
-def test_defaults_start_one_node_and_change_no_parameter(started: Any) -> None:
+def test_the_defaults_are_those_of_the_parameter_file(started: Any) -> None:
     node, = started().nodes
-    assert (node.package, node.executable) == ('accel_calib', 'calibrator')
-    assert node.values() == {}
-    params_file, = node.parameters
+    params_file, = (each for each in node.parameters if not isinstance(each, dict))
+    assert node.package == 'accel_calib'
     assert Path(value_of(params_file, node.context)) == ROOT / 'config' / 'calibrator.yaml'
 
 
-TOPICS = {'imu': 'imu/data_raw', 'output': 'imu/data_calibrated', 'temperature': 'temperature',
-          'linear_acceleration': '~/linear_acceleration'}
-
-
-@pytest.mark.parametrize(('given', 'topics'), table('topics_of_launch'))
-def test_each_topic_has_an_argument_and_is_in_the_namespace_without_a_leading_slash(
-        given: dict[str, str], topics: list[str], started: Any) -> None:
-    node = started(**given).node
-    assert [node.topic(each) for each in TOPICS.values()] == topics
+@pytest.mark.parametrize(('file', 'arguments', 'expected'), table('launches'))
+def test_a_launch_file_starts_nodes_with_these_topics_and_parameters(
+        file: str, arguments: dict[str, str], expected: list[Any], started: Any) -> None:
+    nodes = started(file, **arguments).nodes
+    assert expected == [
+        [node.executable, {name: node.topic(name) for name in topics}, node.values()]
+        for node, (_, topics, _) in zip(nodes, expected, strict=True)]
 
 
 GIVEN = table('launch_arguments')
-ARGUMENTS = {'namespace', 'params_file', 'lifecycle', 'web', 'web_port', *TOPICS, *GIVEN}
+ARGUMENTS = {'namespace', 'params_file', 'lifecycle', 'web', 'web_port', 'imu', 'output',
+             'temperature', 'linear_acceleration', *GIVEN}
 
 
 @pytest.mark.parametrize('name', GIVEN)
@@ -210,22 +198,10 @@ def test_each_parameter_argument_sets_a_parameter_of_its_type(name: str, started
     assert type(given[name]) is type(DEFAULTS[name])
 
 
-def test_web_serves_the_live_page(started: Any) -> None:
-    assert started(web='true').node.values() == {'web_port': WEB_PORT}
-    assert started(web='true', web_port='9000').node.values() == {'web_port': 9000}
-    assert started(web_port='9000').node.values() == {}
-    assert DEFAULTS['web_port'] == 0
-
-
 def test_every_argument_is_described(started: Any) -> None:
     declared = started().declared
     assert set(declared) == ARGUMENTS
     assert all(each.description.endswith('.') for each in declared.values())
-
-
-@pytest.mark.parametrize('text', ['0 0 1.57', '0, 0, 1.57', '[0.0, 0, 1.57]'])
-def test_mounting_is_written_as_in_a_urdf_or_as_in_yaml(text: str, started: Any) -> None:
-    assert started(mounting_rpy=text).node.values() == {'mounting_rpy': [0.0, 0.0, 1.57]}
 
 
 @pytest.mark.parametrize('text', ['0 0', '0 0 x', '1 2 3 4', '[]'])
@@ -249,18 +225,6 @@ def test_lifecycle_starts_the_managed_node_and_activates_it_once(started: Any) -
     assert managed.actions[-3:] == [once_configured, node, configure]
 
 
-def test_two_imus_have_their_own_topics_and_pages_and_share_the_thermometer(started: Any) -> None:
-    nodes = started('two_imus', model='7', web='true').nodes
-    assert [node.topic('imu/data_calibrated') for node in nodes] == [
-        '/left/imu/data_calibrated', '/right/imu/data_calibrated']
-    assert [node.topic('temperature') for node in nodes] == ['/temperature', '/temperature']
-    assert [node.values() for node in nodes] == [
-        {'model': '7', 'web_port': WEB_PORT}, {'model': '7', 'web_port': WEB_PORT + 1}]
-    own = started('two_imus', temperature='temperature').nodes
-    assert [node.topic('temperature') for node in own] == [
-        '/left/temperature', '/right/temperature']
-
-
 @pytest.mark.parametrize('package', ['imu_filter_madgwick', 'robot_localization'])
 def test_no_node_is_started_where_a_filter_is_not_installed(
         package: str, started: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -273,25 +237,6 @@ def test_no_node_is_started_where_a_filter_is_not_installed(
     monkeypatch.setattr(packages, 'get_package_share_path', share)
     with pytest.raises(LookupError, match=package):
         described('with_filters')
-
-
-@pytest.mark.parametrize('namespace', ['', 'robot'])
-def test_filters_are_connected_from_the_raw_readings_to_the_odometry(
-        namespace: str, started: Any) -> None:
-    calibrator, madgwick, filtered = started(
-        'with_filters', namespace=namespace, output='corrected', odometry='wheels',
-        base_link='base').nodes
-    ekf = filtered.values()
-    assert madgwick.topic('imu/data_raw') == calibrator.topic('imu/data_calibrated')
-    assert filtered.topic(ekf['imu0']) == madgwick.topic('imu/data')
-    assert ekf['odom0'] == 'wheels'
-    assert calibrator.values()['output_frame_id'] == ekf['base_link_frame'] == 'base'
-    assert calibrator.values()['fill_covariance'] is True
-    assert ekf['imu0_remove_gravitational_acceleration'] is True
-    assert madgwick.values()['publish_tf'] is False
-    # Three each of: position, attitude, velocity, angular rate, acceleration
-    assert ekf['imu0_config'] == [*[False] * 3, *[True] * 3, *[False] * 3, *[True] * 6]
-    assert ekf['odom0_config'] == [*[False] * 6, True, True, *[False] * 7]
 
 
 # Names of other packages

@@ -114,19 +114,6 @@ def test_removed_pose_is_not_captured_again_in_the_same_rest(readings: Readings)
     assert len(live.poses()) == 2
 
 
-def test_without_auto_capture_only_requested_poses_are_captured(readings: Readings) -> None:
-    live = LiveCapture(CaptureSettings(), MPS2)
-    turned = readings(FACES, dwell=2.0)
-    push_all(live, turned[:90], capture=False)
-    rest = live.detector.current()
-    assert rest is not None
-    live.capture(rest)
-    push_all(live, turned[90:], start=1.8, capture=False)
-    poses = live.poses()
-    assert len(poses) == 1
-    assert poses['reading'][0, 2] > 9.0
-
-
 def book_of(rests: Iterable[Any], repeated: Any = 'merge') -> LiveCapture:
     """Return the poses of rests, each with its time, direction and perhaps temperature."""
     live = LiveCapture(CaptureSettings(repeated=repeated), MPS2)

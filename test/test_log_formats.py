@@ -13,7 +13,7 @@ from accel_calib.logs import LogOptions
 from accel_calib.stillness import capture
 from accel_calib.table import Recording
 from data.logs import make
-from inside import format_named, read_dataflash, read_log, read_ulg
+from inside import format_named, Log, read_log
 import numpy as np
 import pytest
 from shared import LOGS
@@ -22,16 +22,16 @@ from test_logs import write
 WITHIN_SD = 5.0
 
 
-def px4(name: str | Path, *given: str, **more: str) -> Any:
+def px4(name: str | Path, topic: str = '', sensor: str = '') -> Log:
     """Read a sample of PX4, or another path."""
     pytest.importorskip('pyulog')
-    return read_ulg(LOGS / 'px4' / name, *given, **more)
+    return read_log(LOGS / 'px4' / name, LogOptions(topic=topic, sensor=sensor))
 
 
-def ardupilot(name: str | Path, **given: str) -> Any:
+def ardupilot(name: str | Path) -> Log:
     """Read a sample of ArduPilot, or another path."""
     pytest.importorskip('pymavlink')
-    return read_dataflash(LOGS / 'ardupilot' / name, **given)
+    return read_log(LOGS / 'ardupilot' / name)
 
 
 def check(recording: Recording, units: Any, name: str) -> Calibration:
@@ -104,14 +104,14 @@ def test_a_flat_pose_makes_a_level_vehicle_read_up() -> None:
 
 def test_a_log_of_the_default_profile_gives_the_selected_sensor_with_its_temperature() -> None:
     log, samples = px4('default.ulg'), make.recording(40, down=True)
-    assert log.recording.sensor == 'sensor_combined 0'
-    np.testing.assert_allclose(log.recording['temperature'], samples['temperature'], atol=0.08)
-    np.testing.assert_allclose(np.diff(log.recording['time']), 1.0 / make.RATE_HZ, atol=1e-6)
+    assert log.table.sensor == 'sensor_combined 0'
+    np.testing.assert_allclose(log.table['temperature'], samples['temperature'], atol=0.08)
+    np.testing.assert_allclose(np.diff(log.table['time']), 1.0 / make.RATE_HZ, atol=1e-6)
     assert any('CAL_ACC' in note for note in log.notes)
 
 
 def test_the_named_message_and_sensor_of_a_px4_log_are_read() -> None:
-    found = px4('default.ulg', 'sensor_accel', '1').recording
+    found = px4('default.ulg', 'sensor_accel', '1').table
     samples = make.recording(40, down=True)
     assert found.sensor == 'sensor_accel 1'
     np.testing.assert_allclose(found.reading[:, 0], samples.reading[::20, 0] * make.G, rtol=1e-6)
@@ -121,14 +121,14 @@ def test_the_named_message_and_sensor_of_a_px4_log_are_read() -> None:
 
 def test_a_name_of_the_sensor_names_it_and_does_not_choose() -> None:
     log = px4('thermal.ulg', sensor='left imu')
-    assert log.recording.sensor == 'left imu'
+    assert log.table.sensor == 'left imu'
     assert 'sensor_accel 0' in log.read_as
     with pytest.raises(InputError, match='expected a message 3'):
         px4('thermal.ulg', sensor='3')
 
 
 def test_vehicle_imu_is_divided_by_its_interval_and_not_read_without_it(tmp_path: Path) -> None:
-    found = px4('default.ulg', 'vehicle_imu').recording
+    found = px4('default.ulg', 'vehicle_imu').table
     samples = make.recording(40, down=True)
     np.testing.assert_allclose(found.reading[:, 2], samples.reading[::10, 2] * make.G, rtol=1e-6)
     np.testing.assert_allclose(found['rate'][:, 1], samples['rate'][::10, 1], atol=1e-6)
@@ -143,16 +143,16 @@ def test_samples_that_px4_marks_as_invalid_are_left_out_and_counted(tmp_path: Pa
     kind, relative = fields['accelerometer_timestamp_relative']
     fields['accelerometer_timestamp_relative'] = (kind, [0x7fffffff] * 3 + list(relative[3:]))
     log = px4(write(tmp_path, make.ulog_bytes([('sensor_combined', 0, fields)])))
-    assert len(log.recording['time']) == len(relative) - 3
+    assert len(log.table['time']) == len(relative) - 3
     assert '3 rows of' in log.notes[0]
 
 
 def test_flight_logs_that_are_cut_off_are_read_up_to_there(tmp_path: Path) -> None:
     data = (LOGS / 'px4/thermal.ulg').read_bytes()[:40_001]
-    assert 300 < len(px4(write(tmp_path, data)).recording['time']) < 600
+    assert 300 < len(px4(write(tmp_path, data)).table['time']) < 600
     data = (LOGS / 'ardupilot/two_imus.bin').read_bytes()[:50_003]
     log = ardupilot(write(tmp_path, data))
-    assert 400 < len(log.recording['time']) < 600
+    assert 400 < len(log.table['time']) < 600
     assert any('1 message cut' in note for note in log.notes)
 
 
@@ -178,9 +178,9 @@ def test_of_two_sensors_the_lowest_or_the_one_that_is_named_is_read(name: str) -
 
 def test_the_text_log_has_the_numbers_of_the_binary_log() -> None:
     binary, text = ardupilot('two_imus.bin'), ardupilot('one_imu.log')
-    assert set(binary.recording.columns) == set(text.recording.columns)
-    for key, values in binary.recording.columns.items():
-        np.testing.assert_allclose(text.recording[key], values, rtol=1e-6, atol=1e-9)
+    assert set(binary.table.columns) == set(text.table.columns)
+    for key, values in binary.table.columns.items():
+        np.testing.assert_allclose(text.table[key], values, rtol=1e-6, atol=1e-9)
 
 
 def test_garbage_within_an_ardupilot_log_is_passed_over_and_noted(tmp_path: Path) -> None:
@@ -189,8 +189,8 @@ def test_garbage_within_an_ardupilot_log_is_passed_over_and_noted(tmp_path: Path
     path = write(tmp_path, whole[:start] + b'\x00\x17\xff' * 9 + whole[start:])
     log = ardupilot(path)
     assert ' left out' in ' '.join(log.notes)
-    np.testing.assert_array_equal(log.recording.reading[:, 2],
-                                  ardupilot('raw_acc.bin').recording.reading[:, 2])
+    np.testing.assert_array_equal(log.table.reading[:, 2],
+                                  ardupilot('raw_acc.bin').table.reading[:, 2])
 
 
 def test_the_calibration_that_an_ardupilot_log_holds_already_is_named(tmp_path: Path) -> None:

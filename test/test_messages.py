@@ -15,16 +15,16 @@ import math
 import os
 import struct
 
-from accel_calib.effects import context_of_samples, EFFECTS, thermal_stream
+from accel_calib.effects import EFFECTS
 from accel_calib.errors import AccelCalibError, InputError
 from accel_calib.logs import (
     ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
     doubles_at, IMU_DOUBLES, joined, layout_of, LITTLE_ENDIAN, ORIENTATION, ORIENTATION_COVARIANCE,
     renamed, samples_of)
-from accel_calib.messages import corrected, output_frame, Rewriter
+from accel_calib.messages import corrected, OneReading, output_frame, Rewriter
 from accel_calib.units import STANDARD_GRAVITY
 from bag_files import swapped
-from inside import frame_ids, Model, OneReading, rotation_from_rpy, stamps_of
+from inside import frame_ids, Model, rotation_from_rpy, stamps_of
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -85,15 +85,6 @@ def fields_of(count=6):
         root = fields[:, part].reshape(-1, 3, 3) * 0.01
         fields[:, part] = (root @ np.swapaxes(root, 1, 2)).reshape(-1, 9)
     return fields
-
-
-def test_a_message_is_corrected_for_the_context_of_its_time(calibration):
-    warm = with_effects(calibration, {'offset_temperature': [1e-3, -2e-3, 3e-3]})
-    data = message(fields_of(1)[0])
-    at = rewriter_of(data, warm)
-    forces = [doubles_of(at(data, {'temperature': each}))[-12:-9] for each in (20.0, 45.0, 20.0)]
-    assert np.all(np.abs(forces[1] - forces[0]) > 0.1)
-    np.testing.assert_array_equal(forces[2], forces[0])
 
 
 def test_with_a_mounting_all_fields_are_in_one_frame(levelled):
@@ -161,23 +152,6 @@ def test_single_messages_and_arrays_have_the_same_lag(calibration):
              for data, warm in zip(datas, temperature.tolist(), strict=True)]
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
     assert np.ptp(expected[:, ACCELERATION.start]) > 1e-3
-
-
-def test_lag_carries_over_from_block_to_block(calibration):
-    calibration = with_effects(calibration, LAGS, 1e-8)
-    doubles = np.repeat(fields_of(1), 300, axis=0)
-    context = {'time': 100.0 + np.arange(300) * 0.1, 'rate': np.zeros((300, 3)),
-               'temperature': 25.0 + np.arange(300) * 0.01}
-
-    def part(rows, *stream):
-        own = {key: values[rows] for key, values in context.items()}
-        return corrected(calibration, doubles[rows],
-                         context_of_samples(own, len(doubles[rows]), calibration.model, *stream))
-
-    expected, stream = part(slice(None)), thermal_stream(calibration.model)
-    parts = [part(slice(0, 77), stream), part(slice(77, 300), stream)]
-    np.testing.assert_allclose(np.concatenate(parts), expected, rtol=1e-9)
-    assert np.max(np.abs(part(slice(77, 300)) - expected[77:])) > 1e-3
 
 
 def test_no_force_beyond_100_g_is_published(calibration):

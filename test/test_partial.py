@@ -154,13 +154,6 @@ def test_result_does_not_depend_on_the_axis_that_points_up():
         assert np.sqrt(found.covariance[gain, gain]) == pytest.approx(0.0287, rel=0.1)
 
 
-@pytest.mark.parametrize(('up', 'expected'), [
-    (near_up(np.random.default_rng(1), 40, 28.0), True), (np.eye(3)[:1], True),
-    (np.eye(3)[:2], False), (spread_directions(12), False), (np.zeros((0, 3)), False)])
-def test_only_poses_near_one_direction_are_those_of_a_sensor_that_cannot_be_turned(up, expected):
-    assert lies_in_cone(up) is expected
-
-
 def test_poses_of_a_cone_are_for_the_partial_fit_and_those_of_the_sphere_for_the_full_one():
     model, poses = tilting(8, 12)
     with pytest.raises(RefusedFitError, match='within .*° of one direction'):

@@ -11,7 +11,7 @@ from accel_calib.units import units_of
 from inside import MODELS, predict, spread_directions
 import numpy as np
 import pytest
-from shared import data, poses_of, random_directions, run_json, sensor, table
+from shared import data, poses_of, random_directions, sensor, table
 
 
 def fit(name, first, last, gravity, model):
@@ -55,22 +55,6 @@ def test_two_positions_of_the_rhd2000_note():
     calibration = fit_poses(poses_of(volts), units_of('native'), model='12')
     np.testing.assert_allclose(calibration.gain, 0.3468 * np.eye(3), atol=1e-6)
     np.testing.assert_allclose(calibration.offset, 1.775, atol=1e-6)
-
-
-@pytest.mark.parametrize('method', ['ml', 'algebraic'])
-@pytest.mark.parametrize(('name', 'units', 'count', 'limit_mg'), [
-    ('mpu9150_imu0', 'm/s2', 21, 0.3), ('mpu9150_imu1', 'm/s2', 21, 0.3),
-    ('xsens_mti_counts', 'native', 38, 0.115)])  # as well as imu_tk calibrates it
-def test_a_real_recording_is_calibrated_to_its_noise(
-        name, units, count, limit_mg, method, tmp_path, capsys):
-    _, captured = run_json(capsys, 'capture', data(f'{name}.csv'), '-o', tmp_path / 'poses.csv',
-                           '--units', units)
-    _, fitted = run_json(capsys, 'fit', tmp_path / 'poses.csv', '--units', units, '--model', 10,
-                         '--method', method)
-    assert captured['poses'] == count
-    assert fitted['poses_used'] + len(fitted['poses_rejected']) == count
-    assert fitted['rms_before_mg'] > 8.0
-    assert fitted['rms_after_mg'] <= limit_mg
 
 
 NAMES = ('4', '7', '10')

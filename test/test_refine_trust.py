@@ -10,7 +10,6 @@ import re
 import accel_calib as ac
 from accel_calib.calibration import fit_poses, verify
 from accel_calib.effects import add_history
-from accel_calib.errors import RefusedFitError
 from accel_calib.logs import read_recording, write_table
 from accel_calib.refinement import refine
 from accel_calib.stored import write_calibration
@@ -118,26 +117,6 @@ def test_six_faces_report_what_they_cannot_show(arguments, tmp_path, capsys):
     assert 'cross_axis' in [entry['effect'] for entry in result['not_testable']]
     assert result['remaining_gap_mg'] < 2.0
     assert page.read_text().startswith('<!DOCTYPE html>')
-
-
-@pytest.mark.parametrize('seed', [0, 3])
-def test_effects_that_look_alike_end_in_a_result(seed):
-    rng = np.random.default_rng(seed)
-    time = np.arange(60) * 60.0
-    warm = 20.0 + 15.0 * (1.0 - np.exp(-time / 1500.0))
-    model = with_effects(rng, offset_drift=np.r_[rng.normal(size=3) * 0.01, 0.0],
-                         offset_temperature=rng.normal(size=3) * 8e-4,
-                         warm_up=np.r_[rng.normal(size=3) * 0.013, 0.0, 900.0])
-    found = refine(poses_of(model, rng, 60, temperature=warm, time=time), G)
-    assert found.steps
-    assert found.remaining_gap_mg < 0.2 * found.gap_mg
-
-
-def test_poor_repeatability_is_reported_with_its_size():
-    found = ac.refine(table(6, {'repeatability': 4.0}), base='10')
-    assert found.verdict == 'unexplained'
-    line, = (line for line in found.advice if line.startswith('poses repeat '))
-    assert float(line.split()[2]) == pytest.approx(np.hypot(1.0, 4.0), rel=0.3)
 
 
 @pytest.mark.parametrize('structure', [{'taken_back': ('cubic',)}, {'added': ('offset_wander',)}])
@@ -281,18 +260,6 @@ def test_a_stored_curve_over_the_rate_of_temperature_is_compared_with_new_poses(
     assert [step.variable for step in first.steps] == ['temperature_rate']
     assert refine(taken(40), G, base=first.calibration).verdict == 'no_gap'
     assert names(refine(taken(40, axes), G, base=first.calibration)) == ['offset']
-
-
-@pytest.mark.parametrize('seed', range(4))
-def test_twelve_poses_that_cannot_tell_explain_nothing(seed):
-    hidden = ('quadratic', 'offset_temperature', 'offset_drift', 'hysteresis')[seed]
-    try:
-        found = ac.refine(table([55, seed], {hidden: 5.0}, poses=12))
-    except RefusedFitError:
-        return
-    many = any(len(step.rivals) > 3 for step in found.steps)
-    assert found.undecided == bool(found.steps and (many or found.refusal or found.one_curve))
-    assert not found.undecided or found.verdict == 'unexplained'
 
 
 def test_a_walk_beside_an_effect_is_a_step_of_its_own_which_no_calibration_corrects():

@@ -4,9 +4,7 @@
 """The calibrator without ROS: files of each sensor, accepted messages and refusals."""
 
 from dataclasses import replace
-import errno
 from pathlib import Path
-import re
 import shutil
 from typing import Any
 
@@ -15,13 +13,13 @@ from accel_calib.effects import Covariate
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.finding import Finding, has, LEVELS
 from accel_calib.logs import open_log, read_poses, write_table
-from accel_calib.session import CalibratorSettings, changed, next_step, state, Surroundings
+from accel_calib.session import CalibratorSettings, changed, next_step, progress, Surroundings
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Poses
 from driven import Driver, RATE
 from inside import (
     LARGEST_NUMBER_OF_STEPS, Model, poses_changed, rotation_from_rpy, SensorStore,
-    spread_directions, store_of, StreamStatistics, use_calibration, writing_advice)
+    spread_directions, store_of, StreamStatistics, use_calibration)
 import numpy as np
 import pytest
 from shared import GRAVITY, python, Readings, ROOT, rows_of, Stored, table, with_effects
@@ -146,11 +144,11 @@ def test_sensor_that_tumbles_from_the_first_second_is_not_still_until_it_rests(
     up = np.column_stack([np.sin(turn) * np.cos(lean), np.sin(lean), np.cos(turn) * np.cos(lean)])
     for block in np.array_split((up + noise) * per_g, 120):
         driver.feed(block)
-        shown.append(state.progress(driver.session.state).still)
+        shown.append(progress(driver.session.state).still)
     assert not any(shown)
     for direction in (*spread_directions(5), np.array([0.6, 0.0, 0.8])):
         driver.feed((direction + noise[:150]) * per_g)
-    now = state.progress(driver.session.state)
+    now = progress(driver.session.state)
     assert now.still
     np.testing.assert_allclose(now.up, (0.6, 0.0, 0.8), atol=0.1)
 
@@ -283,21 +281,6 @@ def test_reset_removes_poses_and_calibration_but_keeps_the_files(
     assert len(read_poses(home / 'arm_poses.csv.reset1')) == 12
 
 
-def test_context_outside_of_the_ranges_is_limited_with_a_warning(
-        stored: Stored, readings: Readings) -> None:
-    path = stored(sensor='imu_link')
-    write_calibration(path, with_effects(
-        read_calibration(path), {'offset_temperature': [1e-3, 0.0, 0.0]},
-        temperature=np.linspace(20.0, 30.0, 20)))
-    driver, forces = Driver(calibration_file=str(path)), []
-    for temperature, severity in ((25.0, 'GOOD'), (30.0, 'GOOD'), (40.0, 'USABLE')):
-        driver.feed(readings([UP])[:50], temperature=temperature)
-        assert driver.finding('calibration').level == severity
-        forces.append(driver.sensor.force_of((0.0, 0.0, GRAVITY), driver.session.state.context)[0])
-    assert re.findall(r'\d+', driver.finding('calibration').words) == ['40', '20', '30']
-    assert forces[0] != forces[1] == forces[2]
-
-
 # Guidance
 
 
@@ -370,14 +353,6 @@ def statistics_of(*batches: Any, pause: float = 0.3) -> StreamStatistics:
     return found
 
 
-@pytest.mark.parametrize(('length', 'unit'), [(1.0, 'g'), (16384.0, 'native'), (9.8, '')])
-def test_readings_in_another_unit_name_it(length: float, unit: str) -> None:
-    driver = Driver()
-    driver.feed(np.full((50, 3), [0.0, 0.0, length]))
-    words = driver.finding('stream').words
-    assert words.endswith(f'units:={unit}') if unit else 'units' not in words
-
-
 def test_rate_and_faults_of_the_stamps_follow_the_last_seconds() -> None:
     times = [np.arange(60) / 200.0 + 0.3 * k for k in range(30)]
     found = statistics_of(*times)
@@ -430,11 +405,6 @@ def test_a_step_that_cannot_be_used_leaves_the_file_in_use(stored: Stored) -> No
     assert step.exists()
 
 
-def test_advice_about_a_file_that_cannot_be_written_differs_by_the_reason() -> None:
-    reasons = errno.ENOSPC, errno.EROFS, errno.EACCES
-    assert len({writing_advice(OSError(each, 'reason')) for each in reasons}) == len(reasons)
-
-
 @pytest.mark.parametrize('of_sensor', [0.0, 1.0])
 def test_lag_of_the_temperature_is_followed_while_the_node_runs(
         of_sensor: float, stored: Stored, readings: Readings) -> None:
@@ -460,11 +430,11 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
 
     expected, plain = (offline(each)[during].mean(axis=0) for each in (
         calibration, with_values(*values[:3])))
-    np.testing.assert_allclose(driver.sensor.gravity, expected, atol=0.01)
+    np.testing.assert_allclose(driver.session.state.gravity, expected, atol=0.01)
     assert abs(expected[2] - plain[2]) > 0.15
     offered = with_values(*values * [1.0, 1.0, 1.0, 2.0, 1.0])
     driver.session.change_sensor(offered=offered)
-    assert state.progress(driver.session.state).corrected == pytest.approx(
+    assert progress(driver.session.state).corrected == pytest.approx(
         np.linalg.norm(offline(offered)[-1]) / GRAVITY, abs=1e-3)
 
 
@@ -485,7 +455,7 @@ def test_the_heading_needs_a_level_mounting_and_the_nose_down(
     driver.refuses('within 10° of the flat pose', 'set_heading')
     put(driver, readings, NOSE_DOWN)
     driver.ask('set_heading')
-    np.testing.assert_allclose(driver.sensor.applied.rotation, MOUNTING, atol=0.01)
+    np.testing.assert_allclose(driver.session.state.applied.rotation, MOUNTING, atol=0.01)
 
 
 @pytest.mark.parametrize(('frame', 'axes'), [
@@ -503,13 +473,13 @@ def test_messages_are_specific_force_in_every_frame_also_after_a_restart_with_an
     for after in ('ros', frame):
         driver = Driver(calibration_file=str(path), frame=after)
         expected = MOUNTING @ (np.eye(3) if after == 'ros' else axes)
-        np.testing.assert_allclose(driver.sensor.applied.rotation, expected, atol=0.01)
+        np.testing.assert_allclose(driver.session.state.applied.rotation, expected, atol=0.01)
         put(driver, readings, UP)
-        gravity = driver.sensor.gravity / GRAVITY
+        gravity = driver.session.state.gravity / GRAVITY
         np.testing.assert_allclose(gravity, np.array(expected).T @ MOUNTING @ UP, atol=0.01)
         assert gravity[2] * (-1.0 if after == 'ned' else 1.0) > 0.99
         driver.ask('set_level')
-        np.testing.assert_allclose(driver.sensor.applied.rotation, expected, atol=0.01)
+        np.testing.assert_allclose(driver.session.state.applied.rotation, expected, atol=0.01)
         assert ('it is turned' in driver.logged('warning')) is (frame == 'android')
         driver.session.close()
 
@@ -522,7 +492,7 @@ def test_a_stored_mounting_of_the_documents_is_turned_before_it_is_used(
     flat, nose_down = found.predict(np.array([UP, NOSE_DOWN]) @ MOUNTING.T * GRAVITY)
     write_calibration(path, set_heading(level(found, flat, frame), nose_down))
     driver = Driver(calibration_file=str(path), frame='ned')
-    np.testing.assert_allclose(driver.sensor.applied.rotation,
+    np.testing.assert_allclose(driver.session.state.applied.rotation,
                                MOUNTING @ np.diag([1.0, -1.0, -1.0]), atol=1e-6)
     assert f'frame {frame},' in driver.logged('warning')
 

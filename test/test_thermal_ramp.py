@@ -26,13 +26,13 @@ from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Recording
 from accel_calib.units import MG
 from faults.sample import sample
-from inside import export, Intake, RampIntake, thermally_calibrated
+from inside import Intake, RampIntake, thermally_calibrated
 import numpy as np
 import pytest
 from ramps import BENT, G, LINE, offset_at, ramp, twelve_poses, TWISTED, UP, warming, write_ulog
 from scipy.signal import medfilt
 from shared import data, MPS2, refused, rms, run, run_json
-from test_exports import ardupilot, qgroundcontrol
+from test_exports import qgroundcontrol
 from test_log_formats import make
 
 
@@ -108,28 +108,6 @@ def test_deviations_include_correlated_noise_which_does_not_raise_the_degree(wan
     away = np.array([(values - LINE) / deviations
                      for values, deviations in map(coefficients, runs)])
     assert 0.4 < np.sqrt(np.mean(away ** 2)) < 1.6
-
-
-@pytest.mark.parametrize('vendor', VENDORS)
-@pytest.mark.parametrize('seed', sample(range(80, 90), 2))
-def test_coefficients_are_those_of_the_autopilots(vendor, seed, tmp_path):
-    log = ramp(seed, TWISTED, noise_g=0.001)
-    outcome = thermal(log)
-    zero, theirs = VENDORS[vendor](log)
-    text = export(outcome.calibration, vendor).text_or_bytes
-    if vendor == 'px4':
-        written = qgroundcontrol(text)
-        assert written['TC_A0_TREF'] == pytest.approx(zero, abs=0.3)
-        ours = [[written[f'TC_A0_X{k}_{axis}'] for axis in range(3)] for k in (1, 2, 3)]
-    else:
-        written = ardupilot(text, tmp_path)
-        ours = [[written[f'INS_TCAL1_ACC{k}_{axis}'] / 1e6 for axis in 'XYZ'] for k in (1, 2, 3)]
-    half = np.ptp(outcome.curve.range_c) / 2.0
-    apart = (np.array(ours) - theirs[1:]) / G * MG * half ** np.array([[1.0], [2.0], [3.0]])
-    assert np.max(np.abs(apart)) < 1.0  # mg at the end of the range
-    grid = np.linspace(*outcome.curve.range_c, 40)
-    np.testing.assert_allclose(outcome.curve.at(grid), vendor_at((zero, theirs), grid, 25.0),
-                               atol=5e-4)
 
 
 def by_rate(log: Recording, size_g: float) -> Recording:

@@ -51,7 +51,7 @@ from .records import (
     CARRIERS, Covariate, COVARIATES, curves_over, effect_named, EMPIRICAL, EmpiricalCurve,
     formula_of, kind_of, modes_of, shown_name, unchanged, unit_of, value_unit, variable_of,
     variable_words, VARIABLES)
-from .thermal import acting_temperature, between_steps, rate_at, ThermalStream
+from .thermal import acting_temperature, between_steps, covariance_of_steps, rate_at, ThermalStream
 
 __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CATALOGUE', 'CHANGES', 'CONVERGED_G', 'COVARIATES',
            'CUBE', 'EFFECTS', 'EMPIRICAL', 'FORCE', 'FROM_TEMPERATURE', 'LADDER',
@@ -61,10 +61,11 @@ __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CATALOGUE', 'CHANGES', 'CONVERGED_G', 
            'Context', 'Covariate', 'EachShape', 'Effect', 'EffectKey', 'EffectRecord',
            'EmpiricalCurve', 'Model', 'ModelForm', 'OwnEffect', 'ParameterName', 'ThermalStream',
            'acting_temperature', 'add_acting', 'add_history', 'between_steps', 'by_axis',
-           'check_context', 'context_of_samples', 'correct', 'curves_over', 'effect_named',
-           'effects_of_file', 'entry_of', 'factors_of', 'fitted_places', 'formula_of', 'included',
-           'kind_of', 'length_rows', 'linear_model', 'linear_values', 'model_with', 'modes_of',
-           'own_effects', 'own_slope', 'parameter_names', 'parse_effect', 'predict', 'rate_at',
-           'sensor_force', 'shown_name', 'simulate_poses', 'simulate_recording', 'terms_of',
-           'thermal_stream', 'times', 'too_large', 'turn_between', 'unchanged', 'unit_of',
-           'value_unit', 'variable_of', 'variable_words', 'with_vector']
+           'check_context', 'context_of_samples', 'correct', 'covariance_of_steps', 'curves_over',
+           'effect_named', 'effects_of_file', 'entry_of', 'factors_of', 'fitted_places',
+           'formula_of', 'included', 'kind_of', 'length_rows', 'linear_model', 'linear_values',
+           'model_with', 'modes_of', 'own_effects', 'own_slope', 'parameter_names', 'parse_effect',
+           'predict', 'rate_at', 'sensor_force', 'shown_name', 'simulate_poses',
+           'simulate_recording', 'terms_of', 'thermal_stream', 'times', 'too_large',
+           'turn_between', 'unchanged', 'unit_of', 'value_unit', 'variable_of', 'variable_words',
+           'with_vector']

@@ -43,14 +43,14 @@ class Caller:
 
     """
 
-    def __init__(self, bench: Any, number: int = 0, node: str = 'calibrator') -> None:
-        self._bench, self._number, self._node = bench, number, node
+    def __init__(self, bench: Any, number: int = 0) -> None:
+        self._bench, self._number = bench, number
         self.calls: list[Call] = []
         self.last: Call | None = None
 
     def begin(self, name: str, **fields: Any) -> None:
         """Call a service."""
-        client = self._bench.client(name, self._node, self._number)
+        client = self._bench.client(name, self._number)
         self.name, self.last, self._begun = name, None, time.monotonic()
         self._future = client.call_async(client.srv_type.Request(**fields))
 

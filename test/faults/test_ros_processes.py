@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Nodes that are killed at random times, and two nodes on one store: nothing answered is lost."""
+"""Nodes that are killed at random times have stored all that they answered."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -15,18 +15,16 @@ from accel_calib.stored import read_calibration
 from faults.nodes import Caller, send_until, start_poses
 from faults.order import AFTER, Call, State
 from faults.sample import FACTOR
-from inside import CALIBRATOR, is_partial, spread_directions
+from inside import is_partial, spread_directions
 import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
 
 KILLS = 6 * FACTOR
-SECONDS = 6.0 * FACTOR
 COMMANDS = ('capture_pose', 'fit', 'set_level', 'fit', 'undo_pose', 'save', 'capture_pose', 'undo',
             'fit', 'refine', 'calibrate_at_rest', 'load', 'reset')
 _POSES = 12
-_SENSOR = {'sensor': 'arm', 'passthrough': True, 'auto_capture': False}
 _LATEST_KILL_S = 1.5
 
 
@@ -95,20 +93,15 @@ def call_until_killed(bench: Any, node: Any, turned: Any, rng: np.random.Generat
         states = after_call(states, caller.last)
 
 
-@pytest.fixture
-def folder(bench: Any) -> Path:
-    """Return the folder of a store with poses; nodes may be killed."""
-    bench.without_shared_memory()
-    start_poses(bench.home / 'accel_calib' / 'arm_poses.csv', _POSES)
-    return Path(bench.home / 'accel_calib')
-
-
 def test_a_killed_node_has_stored_all_that_it_answered(
-        bench: Any, readings: Callable[..., Any], folder: Path) -> None:
+        bench: Any, readings: Callable[..., Any]) -> None:
+    folder = bench.home / 'accel_calib'
+    start_poses(folder / 'arm_poses.csv', _POSES)
+    bench.without_shared_memory()
     turned, rng = readings(spread_directions(14), dwell=4.0), np.random.default_rng(FACTOR)
     states = [State(_POSES)]
     for _ in range(KILLS):
-        node = bench.calibrator(**_SENSOR)
+        node = bench.calibrator(sensor='arm', passthrough=True, auto_capture=False)
         bench.feed(turned[:100])
         found = call_until_killed(bench, node, turned, rng, states)
         bench.join_anew()
@@ -117,36 +110,3 @@ def test_a_killed_node_has_stored_all_that_it_answered(
         assert not stored.damaged
         states = [state for state in set(found) if stored.agrees(state)]
         assert states, (found[0], stored.calibration, stored.poses)
-
-
-def test_of_two_nodes_one_stores_and_the_other_says_so(
-        bench: Any, readings: Callable[..., Any], folder: Path) -> None:
-    turned, rng = readings(spread_directions(14), dwell=4.0), np.random.default_rng(FACTOR)
-    first = bench.calibrator(**_SENSOR)
-    other = bench.run(*CALIBRATOR, '--ros-args', '-r', '__node:=second', '-p', 'sensor:=arm',
-                      '-p', 'passthrough:=true', '-p', 'auto_capture:=false')
-    names = ('capture_pose', 'fit', 'undo', 'undo_pose', 'set_level', 'save', 'reset')
-    mine, others = Caller(bench), Caller(bench, node='second')
-    states, ends = [State(_POSES)], time.monotonic() + SECONDS
-    while time.monotonic() < ends:
-        name = str(rng.choice(names, p=[0.3, 0.2, 0.15, 0.1, 0.1, 0.1, 0.05]))
-        for caller in (mine, others):
-            caller.begin(name)
-        send_until(bench, turned, lambda: all(caller.poll() for caller in (mine, others)))
-        states = after_call(states, mine.calls[-1])
-    stored = Stored(folder)
-    assert [state for state in states if stored.agrees(state)], stored.poses
-    assert not [call for call in others.calls if call.good]
-    refused = [call for call in others.calls if f'process id {first.pid}' in call.words]
-    assert len(refused) > len(others.calls) // 2
-    bench.end(first, signal.SIGKILL)
-    others.begin('capture_pose')  # the second node takes over
-
-    def captured() -> bool:
-        call = others.poll()
-        if call and not call.good:
-            others.begin('capture_pose')
-        return bool(call and call.good)
-
-    send_until(bench, turned, captured)
-    assert bench.end(other, signal.SIGINT)[0] == 0
