@@ -171,13 +171,13 @@ class Curve:
         return rms(np.linalg.norm(self.left, axis=1)) * MG
 
     def stored(self, *left_out: str) -> tuple[Model, Floats]:
-        """Return the effects that a calibration stores, and their covariance."""
+        """Return the effects that a calibration stores, without some, and their covariance."""
         model = Model({name: values for name, values in self.model.values.items()
                        if name not in left_out} or _UNCHANGED)
-        covariance = np.zeros((len(model.vector),) * 2)
-        names, own = map(parameter_names, (model.effects, self.model.effects))
-        covariance[np.ix_(*[np.isin(names, own)] * 2)] = self.covariance[
-            np.ix_(*[np.isin(own, names)] * 2)]
+        names, own = parameter_names(model.effects), parameter_names(self.model.effects)
+        place, kept = np.isin(names, own), np.isin(own, names)
+        covariance = np.zeros((len(names), len(names)))
+        covariance[np.ix_(place, place)] = self.covariance[np.ix_(kept, kept)]
         return model, covariance
 
 
