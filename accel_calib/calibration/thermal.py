@@ -171,13 +171,13 @@ class Curve:
         return rms(np.linalg.norm(self.left, axis=1)) * MG
 
     def stored(self, *left_out: str) -> tuple[Model, Floats]:
-        """Return the effects that a calibration stores, and their covariance."""
+        """Return the effects that a calibration stores, without some, and their covariance."""
         model = Model({name: values for name, values in self.model.values.items()
                        if name not in left_out} or _UNCHANGED)
-        covariance = np.zeros((len(model.vector),) * 2)
-        names, own = map(parameter_names, (model.effects, self.model.effects))
-        covariance[np.ix_(*[np.isin(names, own)] * 2)] = self.covariance[
-            np.ix_(*[np.isin(own, names)] * 2)]
+        names, own = parameter_names(model.effects), parameter_names(self.model.effects)
+        place, kept = np.isin(names, own), np.isin(own, names)
+        covariance = np.zeros((len(names), len(names)))
+        covariance[np.ix_(place, place)] = self.covariance[np.ix_(kept, kept)]
         return model, covariance
 
 
@@ -305,9 +305,8 @@ class _Board:
 
     def predicted(self, model: Model) -> Floats:
         """Return the (n, 3) offset of each stretch [g]."""
-        if not model.effects:
-            return np.zeros((len(self.levels), 3))
-        return np.concatenate([model.at(each).vec_v for each in self.contexts])
+        return np.concatenate([np.zeros_like(each['reading']) + model.at(each).vec_v
+                               for each in self.contexts])
 
     def _covariance(self, design: Floats, onto: Floats) -> Floats:
         """Return the covariance of values that are `onto`, (q, 3, n), times the readings."""
@@ -341,8 +340,6 @@ def _lagged(form: Form) -> bool:
 
 def _basis(model: Model, contexts: Sequence[Context]) -> Floats:
     """Return the (n, 3, p) derivative of the offset by all values."""
-    if not model.effects:
-        return np.zeros((sum(len(each['time']) for each in contexts), 3, 0))
     return np.concatenate([model.basis(np.zeros((len(each['time']), 3)), each).full
                            for each in contexts])
 

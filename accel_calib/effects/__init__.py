@@ -43,9 +43,9 @@ from .history import (
     add_acting, add_history, context_of_samples, FROM_TEMPERATURE, model_with, parse_effect,
     simulate_poses, simulate_recording, thermal_stream, turn_between)
 from .model import (
-    AtContext, check_context, CONVERGED_G, correct, EachShape, factors_of, LARGEST_FORCE_G,
-    LARGEST_ITERATIONS, length_rows, linear_model, Model, own_slope, predict, sensor_force, times,
-    too_large, with_vector)
+    check_context, CONVERGED_G, correct, EachShape, factors_of, LARGEST_FORCE_G,
+    LARGEST_ITERATIONS, length_rows, linear_model, Model, own_slope, predict, sensor_force,
+    terms_of, times, too_large, with_vector)
 from .own import effects_of_file, own_effects, OwnEffect
 from .records import (
     CARRIERS, Covariate, COVARIATES, curves_over, effect_named, EMPIRICAL, EmpiricalCurve,
@@ -58,7 +58,7 @@ __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CATALOGUE', 'CHANGES', 'CONVERGED_G', 
            'LARGEST_FORCE_G', 'LARGEST_ITERATIONS', 'MODELS', 'MONOMIALS', 'NOMINAL_SUPPLY',
            'ODD_SQUARE', 'OFFSET_POWERS', 'ONE', 'PROCESSES', 'PRODUCT', 'REFERENCE_TEMPERATURE',
            'SIZE', 'SQUARE', 'TO_SEPARATE', 'VARIABLES', 'WANDER', 'WAVE', 'ZONAL', 'ZONES',
-           'AtContext', 'Context', 'Covariate', 'EachShape', 'Effect', 'EffectKey', 'EffectRecord',
+           'Context', 'Covariate', 'EachShape', 'Effect', 'EffectKey', 'EffectRecord',
            'EmpiricalCurve', 'Model', 'ModelForm', 'OwnEffect', 'ParameterName', 'ThermalStream',
            'acting_temperature', 'add_acting', 'add_history', 'between_steps', 'by_axis',
            'check_context', 'context_of_samples', 'correct', 'covariance_of_steps', 'curves_over',
@@ -66,5 +66,6 @@ __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CATALOGUE', 'CHANGES', 'CONVERGED_G', 
            'formula_of', 'included', 'kind_of', 'length_rows', 'linear_model', 'linear_values',
            'model_with', 'modes_of', 'own_effects', 'own_slope', 'parameter_names', 'parse_effect',
            'predict', 'rate_at', 'sensor_force', 'shown_name', 'simulate_poses',
-           'simulate_recording', 'thermal_stream', 'times', 'too_large', 'turn_between',
-           'unchanged', 'unit_of', 'value_unit', 'variable_of', 'variable_words', 'with_vector']
+           'simulate_recording', 'terms_of', 'thermal_stream', 'times', 'too_large',
+           'turn_between', 'unchanged', 'unit_of', 'value_unit', 'variable_of', 'variable_words',
+           'with_vector']

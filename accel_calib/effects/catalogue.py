@@ -166,20 +166,18 @@ def _centripetal(context: Mapping[str, Any], shape: Floats) -> Floats:
     return np.array(entries) / STANDARD_GRAVITY
 
 
-_effect = partial(Effect, plausible_g=0.5)
-_bending = partial(Effect, plausible_g=0.5, family='force')
-_in_time = partial(Effect, plausible_g=0.5, family='time')
+_bending, _in_time = partial(Effect, family='force'), partial(Effect, family='time')
 _LAG = ('lag', 'of_sensor')
 
 EFFECTS: dict[str, Effect] = {
     'offset': Effect('zero-g offset', 'bias K0, zero-g offset', AXES, 'g', 0.1, plausible_g=1.0,
-                     terms=by_axis(ONE), repeatable_g=0.03),
-    'gain': _effect('one gain for all axes', 'scale factor K1, sensitivity', ('all',), 'g/g', 0.03,
-                    terms=ALL_AXES, repeatable_g=0.015),
-    'axis_gain': _effect(
+                     repeatable_g=0.03),
+    'gain': Effect('one gain for all axes', 'scale factor K1, sensitivity', ('all',), 'g/g', 0.03,
+                   terms=ALL_AXES, repeatable_g=0.015),
+    'axis_gain': Effect(
         'gain of each axis', 'scale factor K1, sensitivity', AXES, 'g/g', 0.03,
         terms=by_axis(FORCE), includes=('gain',), repeatable_g=0.015),
-    'cross_axis': _effect(
+    'cross_axis': Effect(
         'cross-axis gain, symmetric', 'cross-axis sensitivity', ('xy', 'xz', 'yz'), 'g/g', 0.02,
         terms=CROSS, repeatable_g=0.015),
     'misalignment': Effect(
@@ -200,16 +198,15 @@ EFFECTS: dict[str, Effect] = {
                     for k, (i, j) in enumerate(_COUPLED))),
     'offset_temperature': _in_time(
         'offset that changes with temperature', 'zero-g offset temperature coefficient TCO', AXES,
-        'g/°C', 0.001, terms=by_axis(ONE), factor=_lagged_warming('temperature_of_offset'),
-        needs=('temperature',), shape=_LAG, shapes=_lags, usual=(0.0, 0.0),
-        lagged='temperature_of_offset'),
+        'g/°C', 0.001, factor=_lagged_warming('temperature_of_offset'), needs=('temperature',),
+        shape=_LAG, shapes=_lags, usual=(0.0, 0.0), lagged='temperature_of_offset'),
     'offset_temperature_quadratic': _in_time(
         'offset that changes with the square of temperature', 'second-order TCO', AXES, 'g/°C²',
-        1e-5, terms=by_axis(ONE), needs=('temperature',),
+        1e-5, needs=('temperature',),
         factor=lambda context, shape: (context['temperature'] - REFERENCE_TEMPERATURE) ** 2),
     'offset_temperature_cubic': _in_time(
         'offset that changes with the cube of temperature', 'third-order TCO', AXES, 'g/°C³',
-        1e-7, terms=by_axis(ONE), needs=('temperature',),
+        1e-7, needs=('temperature',),
         factor=lambda context, shape: (context['temperature'] - REFERENCE_TEMPERATURE) ** 3),
     'gain_temperature': _in_time(
         'gain that changes with temperature', 'sensitivity temperature coefficient TCS', AXES,
@@ -218,23 +215,21 @@ EFFECTS: dict[str, Effect] = {
         lagged='temperature_of_gain'),
     'temperature_rate': _in_time(
         'offset in proportion to the rate of the temperature', 'thermal gradient sensitivity',
-        AXES, 'g·s/°C', 0.02, terms=by_axis(ONE), factor=lambda context, shape: rate_at(context),
+        AXES, 'g·s/°C', 0.02, factor=lambda context, shape: rate_at(context),
         needs=('time', 'temperature'), over=('temperature_rate',)),
     'supply_ratio': Effect(
         'offset and gain in proportion to the supply', 'ratiometric output', ('gain', *AXES),
         'g/g', 1.0, plausible_g=1.0, terms=_SUPPLY, needs=('supply_voltage',), scales=True,
         factor=lambda context, shape: context['supply_voltage'] / NOMINAL_SUPPLY - 1.0),
     'offset_drift': _in_time(
-        'offset that drifts with time', 'bias drift', AXES, 'g/h', 0.0005, terms=by_axis(ONE),
-        factor=_since, needs=('time',), shape=('start',), shapes=_from_start),
+        'offset that drifts with time', 'bias drift', AXES, 'g/h', 0.0005, factor=_since,
+        needs=('time',), shape=('start',), shapes=_from_start),
     'warm_up': _in_time(
         'offset that settles after power-on', 'turn-on transient', AXES, 'g', 0.005,
-        terms=by_axis(ONE), factor=_settling, needs=('time',), shape=('start', 'tau'),
-        shapes=_taus),
+        factor=_settling, needs=('time',), shape=('start', 'tau'), shapes=_taus),
     'offset_step': _in_time(
         'offset that jumps at an instant', 'bias shift after shock', AXES, 'g', 0.005,
-        terms=by_axis(ONE), factor=_after, needs=('time',), shape=('instant',),
-        shapes=_instants),
+        factor=_after, needs=('time',), shape=('instant',), shapes=_instants),
     'gain_drift': _in_time(
         'gain that drifts with time', 'scale-factor drift', AXES, '1/h', 0.0005,
         terms=by_axis(FORCE), factor=_since, needs=('time',), shape=('start',),
@@ -243,18 +238,17 @@ EFFECTS: dict[str, Effect] = {
         'gain that jumps at an instant', 'scale-factor shift after shock', AXES, 'g/g', 0.005,
         terms=by_axis(FORCE), factor=_after, needs=('time',), shape=('instant',),
         shapes=_instants),
-    'vibration_rectification': _effect(
+    'vibration_rectification': Effect(
         'offset that grows with vibration', 'vibration rectification coefficient VRC', AXES,
-        'g/g²', 0.002, terms=by_axis(ONE), needs=('std',),
+        'g/g²', 0.002, needs=('std',),
         factor=lambda context, shape: np.asarray(context['std'], float).T ** 2),
-    'hysteresis': _effect(
+    'hysteresis': Effect(
         'offset that depends on the previous pose', 'hysteresis', AXES, 'g', 0.001,
-        terms=by_axis(ONE), factor=_motion, needs=('previous',), shape=('form', 'memory'),
-        shapes=_motions, usual=(0.0, 0.0)),
-    'creep': _effect(
-        'offset that relaxes after a turn', 'creep', AXES, 'g', 0.001, terms=by_axis(ONE),
-        factor=_creep, needs=('time', 'previous'), shape=('tau',), shapes=_relaxations,
-        over=('since_turn',)),
+        factor=_motion, needs=('previous',), shape=('form', 'memory'), shapes=_motions,
+        usual=(0.0, 0.0)),
+    'creep': Effect(
+        'offset that relaxes after a turn', 'creep', AXES, 'g', 0.001, factor=_creep,
+        needs=('time', 'previous'), shape=('tau',), shapes=_relaxations, over=('since_turn',)),
     'lever_arm': Effect(
         'centripetal force away from the axis of rotation', 'size effect', AXES, 'm', 0.1,
         plausible_g=5.0, terms=_LEVER, factor=_centripetal, needs=('rate',)),

@@ -153,6 +153,12 @@ class Term(NamedTuple):
     weight: float = 1.0
 
 
+def by_axis(first: int) -> tuple[Term, ...]:
+    """Return terms with one parameter and one monomial per axis."""
+    step = 0 if first == ONE else 1
+    return tuple(Term(axis, axis, first + step * axis) for axis in range(3))
+
+
 Factor = Callable[[Mapping[str, Any], Floats], Any]
 """Context, shape -> factor of all terms, (n,), or of each term, (t, n); one row has no axis n."""
 
@@ -178,7 +184,7 @@ class Effect:
     plausible_g : float
         Largest contribution to the reading of a working accelerometer [g]; infinite: no limit.
     terms : tuple of Term
-        What the effect adds to the reading.
+        What the effect adds to the reading; by default an offset of each axis.
     factor : callable or None
         Factor of the terms; None: 1.
     needs, over : tuple of str
@@ -218,8 +224,8 @@ class Effect:
     parameters: tuple[str, ...]
     unit: str
     typical: float
-    plausible_g: float
-    terms: tuple[Term, ...]
+    plausible_g: float = 0.5
+    terms: tuple[Term, ...] = by_axis(ONE)
     factor: Factor | None = None
     needs: tuple[str, ...] = ()
     shape: tuple[str, ...] = ()
@@ -319,7 +325,7 @@ _SHAPE_STEP = 1e-4
 
 
 def difference(factor: Factor, context: Context, shape: Floats, place: int,
-               bounds: Sequence[tuple[float, float]] = ()) -> Floats:
+               bounds: Sequence[tuple[float, float]]) -> Floats:
     """Return the numerical derivative of a factor by one shape constant, inside its bounds."""
     low, high = bounds[place] if bounds else (-np.inf, np.inf)
     step = _SHAPE_STEP * (high - low if bounds else max(abs(shape[place]), 1.0))
@@ -333,12 +339,6 @@ def fitted_places(effect: Effect, shape: Floats) -> list[int]:
     usual = dict(enumerate(effect.usual))
     return [place for place, name in enumerate(effect.shape)
             if (effect.own or name in _FITTED_SHAPES) and usual.get(place) != shape[place]]
-
-
-def by_axis(first: int) -> tuple[Term, ...]:
-    """Return terms with one parameter and one monomial per axis."""
-    step = 0 if first == ONE else 1
-    return tuple(Term(axis, axis, first + step * axis) for axis in range(3))
 
 
 def matrix_terms(entries: Iterable[tuple[int, int, int, float]]) -> tuple[Term, ...]:

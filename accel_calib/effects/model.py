@@ -16,7 +16,7 @@ readings are in g; `accel_calib.units` converts them.
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from itertools import accumulate
 import math
 from typing import Any, NamedTuple
@@ -273,16 +273,6 @@ def times(matrix: Floats, vectors: Floats) -> Floats:
     return (matrix @ vectors[:, :, np.newaxis])[:, :, 0]
 
 
-class _Change(NamedTuple):
-    """A value that changes the factors of the terms `rows`: a shape constant, or a scale."""
-
-    rows: slice | Indices
-    value: int
-    effect: Effect | None  # None: it scales them
-    shape: Floats
-    place: int  # in the shape, or of the term that scales
-
-
 @dataclass(frozen=True, eq=False)
 class Model(Record):
     """
@@ -372,13 +362,9 @@ class Model(Record):
     @cached_property
     def fitted(self) -> NDArray[np.bool_]:
         """(p,) mask of the values that a fit changes."""
-        found = np.zeros(len(self.vector), bool)
-        for part, (effect, shape) in zip(self.terms.parts, self._by_effect, strict=True):
-            end = part.stop - len(shape)
-            found[part.start:end] = True
-            if len(shape):
-                found[[end + place for place in fitted_places(effect, shape)]] = True
-        return found
+        return np.array([is_fitted for effect, shape in self._by_effect for is_fitted in (
+            *[True] * len(effect.parameters),
+            *(place in fitted_places(effect, shape) for place in range(len(shape))))], bool)
 
     @cached_property
     def _by_effect(self) -> list[tuple[Effect, Floats]]:
@@ -462,51 +448,49 @@ class Model(Record):
         alone, scales = self._factors(context, u)
         context = {**context, 'force': u}
         found = [plain * (alone * scales)]
-        for each in self._changes:
-            if each.effect is None or each.effect.factor is None:
-                change = alone[each.rows] * alone[each.place]
-            else:
-                change = np.nan_to_num(difference(
-                    each.effect.factor, context, each.shape, each.place, each.effect.bounds)
-                    ) * scales[each.rows]
-            values = self.vector[self.terms.value[each.rows]][:, np.newaxis]
-            found.append(plain[each.rows] * values * change)
+        for rows, _, slope in self._changes:
+            change = (alone[rows] * alone[slope] if isinstance(slope, int) else
+                      np.nan_to_num(slope(context)) * scales[rows])
+            values = self.vector[self.terms.value[rows]][:, np.newaxis]
+            found.append(plain[rows] * values * change)
         return replace(self.rows, terms=np.concatenate(found))
 
     @cached_property
     def rows(self) -> Basis:
         """Return the basis for values, factors and forces of 1: which term has which value."""
         terms, every = self.terms, np.arange(len(self.terms.weight))
-        which = np.concatenate([every, *(every[each.rows] for each in self._changes)])
-        value = np.concatenate([terms.value, *(np.full(len(every[each.rows]), each.value)
-                                               for each in self._changes)])
+        which = np.concatenate([every, *(every[rows] for rows, _, _ in self._changes)])
+        value = np.concatenate([terms.value, *(np.full(len(every[rows]), value)
+                                               for rows, value, _ in self._changes)])
         return Basis(terms.weight[which, np.newaxis], terms.place[which], terms.axis[which],
                      _sums(value, len(self.vector)))
 
     @cached_property
-    def _changes(self) -> tuple[_Change, ...]:
-        """Values that change factors: fitted shape constants, and a gain that scales others."""
+    def _changes(self) -> list[tuple[slice | Indices, int, Callable[[Context], Floats] | int]]:
+        """
+        Return the rows of terms whose factor a value changes, the value, and the derivative by it.
+
+        These are fitted shape constants, and a gain that scales others (the index of its term).
+
+        """
         terms = self.terms
-        found = [_Change(rows, part.stop - len(shape) + place, effect, shape, place)
-                 for part, rows, (effect, shape) in zip(terms.parts, terms.rows, self._by_effect)
-                 if effect.factor is not None and np.any(self.vector[terms.value[rows]])
-                 for place in fitted_places(effect, shape)]
+        found: list[Any] = [
+            (rows, part.stop - len(shape) + place, partial(
+                difference, effect.factor, shape=shape, place=place, bounds=effect.bounds))
+            for part, rows, (effect, shape) in zip(terms.parts, terms.rows, self._by_effect)
+            if effect.factor is not None and np.any(self.vector[terms.value[rows]])
+            for place in fitted_places(effect, shape)]
         if terms.scaling is not None:
             term, value, scaled = terms.scaling
-            found.append(_Change(scaled, value, None, np.zeros(0), term))
-        return tuple(found)
+            found.append((scaled, value, term))
+        return found
 
 
-@dataclass(frozen=True)
-class EachShape:
-    """An effect with s shapes, by the (s, t or 1, n) factors of its terms at the poses."""
+class EachShape(NamedTuple):
+    """The terms of an effect with s shapes, by their (s, t or 1, n) factors at the poses."""
 
-    effect: EffectKey
+    terms: Terms
     factors: Floats
-
-    @property
-    def terms(self) -> Terms:
-        return terms_of((self.effect,))
 
     def basis_of(self, plain: Floats, context: Context, u: Floats) -> Basis:
         """Return the derivative of the reading by the parameters; see `Model.basis_of`."""

@@ -198,7 +198,7 @@ class OwnEffect(EffectRecord):
         axes = [k for k, axis in enumerate(AXES) if axis in self.axes or self.axes == _ALL]
         return Effect(
             words=self.words, term='own effect', unit=self.unit, typical=self.typical,
-            parameters=(_ALL,) if self.axes == _ALL else tuple(self.axes), plausible_g=0.5,
+            parameters=(_ALL,) if self.axes == _ALL else tuple(self.axes),
             terms=tuple(Term(k * (self.axes != _ALL), axis, ONE) for k, axis in enumerate(axes)),
             factor=self._factor if self._columns else None, over=over,
             needs=tuple(dict.fromkeys(need for key in over for need in _NEEDS.get(key, (key,)))),

@@ -194,8 +194,7 @@ def _entry_of_curve(curve: EmpiricalCurve) -> Effect:
         terms = tuple(Term(k, axis, ZONAL + 3 * number + axis)
                       for k, number in enumerate(zones) for axis in range(3))
         return Effect(f'gain as a smooth function of {VARIABLES["direction"]}',
-                      'empirical curve', names, curve.unit, 0.001, plausible_g=0.5, terms=terms,
-                      family='force')
+                      'empirical curve', names, curve.unit, 0.001, terms=terms, family='force')
     parts, of_force = curve.parts, variable == 'force'
     carried = [term._replace(parameter=parts.index(own)) for term in _CARRIED[curve.carrier]
                if (own := CARRIERS[curve.carrier][term.parameter]) in parts]
@@ -207,8 +206,7 @@ def _entry_of_curve(curve: EmpiricalCurve) -> Effect:
     names = tuple(f'{own}_{mode}' for mode in modes for own in parts)
     words = (f'{curve.changed.replace("_", "-")} as a smooth function of '
              f'{variable_words(variable)}')
-    made = Effect(words, 'empirical curve', names, curve.unit, 0.001, plausible_g=0.5,
-                  terms=terms)
+    made = Effect(words, 'empirical curve', names, curve.unit, 0.001, terms=terms)
     if of_force:
         return replace(made, family='force')
     return replace(made, factor=partial(_cosines, variable, modes, len(carried)),
@@ -262,7 +260,7 @@ def _entry_of_covariate(covariate: Covariate) -> Effect:
     return Effect(
         words=f'{what} that changes with {" times ".join(map(variable_words, columns))}',
         term=f'coefficient of {covariate.variable}', parameters=names, unit=unit, typical=np.inf,
-        plausible_g=0.5, terms=terms, factor=departure, needs=columns, shapes=means,
+        terms=terms, factor=departure, needs=columns, shapes=means,
         shape=('zero',) if len(columns) == 1 else tuple(f'zero_{each}' for each in columns),
         usual=(0.0,) * len(columns),
         includes=(replace(covariate, power=1),) if has_square else ())

@@ -12,16 +12,16 @@ not locate or show. `closed_form` computes start values.
 """
 
 from .closed_form import closed_form, faces, fit_12, fit_sphere, sensing_axes, start_of, TIES
-from .equations import believable, Equations, kinds, originals, pose_noise, variance_factor
+from .equations import believable, kinds, originals, pose_noise, variance_factor
 from .fit import (
     by_pose, estimate, Fit, judge, left_out, NotConvergedError, Point, Prior, solve, stated)
 from .outliers import (
     beside_scatter, covariance_with, fit_robust, LARGEST_SHARE, outliers, outliers_among, Rival,
     rivals, scatter_of, unseen_mistakes, with_scatter_of)
 
-__all__ = ['LARGEST_SHARE', 'TIES', 'Equations', 'Fit', 'NotConvergedError', 'Point', 'Prior',
-           'Rival', 'believable', 'beside_scatter', 'by_pose', 'closed_form', 'covariance_with',
-           'estimate', 'faces', 'fit_12', 'fit_robust', 'fit_sphere', 'judge', 'kinds', 'left_out',
+__all__ = ['LARGEST_SHARE', 'TIES', 'Fit', 'NotConvergedError', 'Point', 'Prior', 'Rival',
+           'believable', 'beside_scatter', 'by_pose', 'closed_form', 'covariance_with', 'estimate',
+           'faces', 'fit_12', 'fit_robust', 'fit_sphere', 'judge', 'kinds', 'left_out',
            'originals', 'outliers', 'outliers_among', 'pose_noise', 'rivals', 'scatter_of',
            'sensing_axes', 'solve', 'start_of', 'stated', 'unseen_mistakes', 'variance_factor',
            'with_scatter_of']

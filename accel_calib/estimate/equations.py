@@ -56,7 +56,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from ..effects import Context, EachShape, EffectKey, Model, times
+from ..effects import Context, EachShape, EffectKey, Model, terms_of, times
 from ..geometry import unit
 from ..table import Poses
 from ..units import Floats, Indices, NORMAL_95, over_axes, STATED_NOISE
@@ -140,17 +140,10 @@ def originals(poses_g: Poses) -> Indices:
     # Two readings half a cell apart are in the same cell of at least one of these grids.
     for shift in product((0.0, 0.5), repeat=3):
         rows = np.column_stack([np.floor(place + shift), *context])
-        # A hash is sorted faster than rows, and few rows are not the only ones with their hash.
-        bits = (rows + 0.0).view(np.uint64)  # -0.0 becomes 0.0
-        bits ^= bits >> 32  # the low bits of whole numbers are zero
-        factors = np.random.default_rng(1).integers(2 ** 63, size=rows.shape[1], dtype=np.uint64)
-        mixed = bits @ (2 * factors + 1)
-        ordered = np.sort(mixed)
-        again = np.flatnonzero(np.isin(mixed, ordered[1:][ordered[1:] == ordered[:-1]]))
-        _, first, which = np.unique(mixed[again], return_index=True, return_inverse=True)
-        first = again[first[which]]
-        equal = np.all(rows[first] == rows[again], axis=1)
-        found[again] = np.minimum(found[again], np.where(equal, first, again))
+        order = np.lexsort(rows.T)
+        is_new = np.any(np.diff(rows[order], axis=0, prepend=np.nan) != 0.0, axis=1)
+        first = np.minimum.reduceat(order, np.flatnonzero(is_new))
+        found[order] = np.minimum(found[order], first[np.cumsum(is_new) - 1])
     return found[found]
 
 
@@ -259,8 +252,8 @@ class Equations:
 
     def columns_of(self, effect: EffectKey, factors: Floats) -> Floats:
         """Return the (m, s p) derivative for s shapes; factors as from `effects.factors_of`."""
-        return np.concatenate([part.columns(EachShape(
-            effect, factors if factors.shape[2] == 1 else factors[:, :, part.which]))
+        return np.concatenate([part.columns(EachShape(terms_of((effect,)), (
+            factors if factors.shape[2] == 1 else factors[:, :, part.which])))
             for part in self.parts])
 
     def of_poses(self, residual: Floats) -> Floats:
