@@ -151,15 +151,10 @@ def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str
     """
     calibration, curve = outcome.calibration, outcome.curve
     names = ', '.join(Path(source).name or source for source in sources)
-    low, high = curve.range_c
     return page(
         'thermal', f'Offset over temperature of {calibration.sensor or names}',
         (', '.join(sources), calibration.date and f'fitted {calibration.date}'), outcome.rating,
-        key_numbers=[('range', f'{low:.1f} to {high:.1f} °C'), ('degree', str(curve.degree)),
-                     ('change', f'{short(curve.change_mg)} mg'),
-                     ('residual', f'{short(curve.residual_mg)} mg'),
-                     ('uncertainty up to', f'{short(curve.band_mg)} mg')],
-        drawings=(_draw_axis(curve, axis) for axis in range(3)),
+        curve=curve, drawings=(_draw_axis(curve, axis) for axis in range(3)),
         held_out=[(name or 'none', short(error)) for name, error in curve.held_out_mg.items()],
         notes=notes, **_values(calibration, stored))
 
