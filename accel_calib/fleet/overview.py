@@ -29,6 +29,11 @@ certain. They are reduced by n / (n + `_SURE`). The mean of n sensors is uncerta
 adds P / n to the covariance for another sensor. At last P is enlarged, if necessary, until half of
 the sensors are within the distance that contains half of a normal distribution.
 
+**Page.** Its size does not grow with the number of sensors: tables end after 200 lines, and lists
+of figures after `_MOST_CHANGED`, `_MOST_ODD` and `_NEWEST` sensors. The values are drawn as
+histograms, and the drift of all sensors as bands of quantiles. The page says how many sensors it
+does not show; `sensors.parquet` and the rows of the recordings have all of them.
+
 """
 
 from __future__ import annotations
@@ -328,12 +333,6 @@ def _squared(away: Floats, covariances: Floats) -> Floats:
 
 PAGE = 'fleet.html'
 
-_MOST = 200
-"""Largest number of lines of a table."""
-
-_LONG = 20
-"""Number of lines above which a table scrolls."""
-
 _MOST_MODELS = 6
 """Largest number of models of sensors with figures."""
 
@@ -376,8 +375,8 @@ def write_fleet_page(store: Store, known: Overview, sensors: Sequence[Row],
         'fleet', 'Fleet', (), rating_of(known, sensors), heading='Calibrations of a fleet',
         script=False,  # the browser shows the text of a marker that is pointed at
         has_figures=drawn_too, left_out=known.left_out, models=models, most_models=_MOST_MODELS,
-        differ=differ, changes=changes, over_time=drawings, others=others, most=_MOST,
-        long=_LONG, failed=sum(known.counts[status] for status in ('error', 'unread')),
+        differ=differ, changes=changes, over_time=drawings, others=others,
+        failed=sum(known.counts[status] for status in ('error', 'unread')),
         errors=[(row['recording'], row['error'], row['advice']) for row in known.errors]))
 
 
