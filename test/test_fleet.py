@@ -29,7 +29,7 @@ from accel_calib.effects import effects_of_file
 from accel_calib.errors import InputError
 from accel_calib.fleet import cluster, Input, Options, run, Store
 from accel_calib.logs import write_table
-from accel_calib.stored import read_calibration
+from accel_calib.stored import read_calibration, read_prior
 from faults.sample import FACTOR, sample
 from fleet_case import (
     found_in, OFFSET, page_of, QUICK, rows_of, state_of, write_fleet, write_poses)
@@ -98,11 +98,11 @@ def test_each_recording_becomes_a_row_and_a_calibration_on_the_workers(
         calibrate: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_fleet(tmp_path / 'in', 6, 2)
     (tmp_path / 'in' / 'bad.csv').write_text('nothing of use\n')
-    for where, name in ((Store, 'merge'), (sys.modules[overview.__module__], 'read_parquet')):
+    for where, name in ((Store, 'merge'), (sys.modules[overview.__module__], 'digest')):
         monkeypatch.setattr(where, name, None)  # in this process, which must not need them
     summary = calibrate()
     assert summary.counts == {'ok': 12, 'error': 1}
-    assert summary.priors[''].sensors == 6
+    assert read_prior(tmp_path / 'out' / 'fleet.yaml').sensors == 6
     assert len(summary.sensors) == 7
     assert 'bad.csv' in page_of(tmp_path / 'out')
     assert not list((tmp_path / 'out' / 'pending').iterdir())
@@ -404,7 +404,7 @@ def test_typical_values_that_no_longer_hold_are_removed(
     store = Store(shutil.copytree(undisturbed, tmp_path / 'out'))
     assert (store.folder / 'fleet.yaml').exists()
     by_robot = replace(QUICK, model_from=r'robot_\d')
-    assert not run(client, found_in(recorded), by_robot, store).priors
+    run(client, found_in(recorded), by_robot, store)
     assert not (store.folder / 'fleet.yaml').exists()
 
 

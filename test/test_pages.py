@@ -168,8 +168,8 @@ def test_the_policy_of_a_page_stops_what_is_not_its_own(browser, tmp_path, has_s
                '<link rel="stylesheet" href="https://127.0.0.1:9/x.css">'
                '<iframe srcdoc="x"></iframe><form action="https://127.0.0.1:9/">')
     rating = Rating('GOOD', 'reason', 'figures', NextStep('done', 'nothing'))
-    text = page_of('noise', 'Title', [], rating, script=has_script, **dict.fromkeys(
-        ('key_numbers', 'drawings', 'tables', 'notes', 'needs', 'kalibr'), ()))
+    text = page_of('comparison', 'Title', [], rating, script=has_script, **dict.fromkeys(
+        ('history', 'drawings', 'runs', 'parameters', 'notes'), ()))
     page, complaints = opened(browser, tmp_path / 'page.html',
                               text.replace('</main>', f'{hostile}</main>'))
     for each in ('script', 'event handler', 'image', 'stylesheet'):

@@ -29,6 +29,11 @@ certain. They are reduced by n / (n + `_SURE`). The mean of n sensors is uncerta
 adds P / n to the covariance for another sensor. At last P is enlarged, if necessary, until half of
 the sensors are within the distance that contains half of a normal distribution.
 
+**Page.** Its size does not grow with the number of sensors: tables end after 200 lines, and lists
+of figures after `_MOST_CHANGED`, `_MOST_ODD` and `_NEWEST` sensors. The values are drawn as
+histograms, and the drift of all sensors as bands of quantiles. The page says how many sensors it
+does not show; `sensors.parquet` and the rows of the recordings have all of them.
+
 """
 
 from __future__ import annotations
@@ -328,12 +333,6 @@ def _squared(away: Floats, covariances: Floats) -> Floats:
 
 PAGE = 'fleet.html'
 
-_MOST = 200
-"""Largest number of lines of a table."""
-
-_LONG = 20
-"""Number of lines above which a table scrolls."""
-
 _MOST_MODELS = 6
 """Largest number of models of sensors with figures."""
 
@@ -359,13 +358,25 @@ def write_fleet_page(store: Store, known: Overview, sensors: Sequence[Row],
         odd_names += [sensor for sensor, _, _, _ in odd]
         prefix = f'model{number}' if drawn_too and number < _MOST_MODELS else ''
         models.append({'name': name, **_section(own, odd, priors.get(name), prefix)})
+    changes = list[tuple[str, ...]]()  # lines about the sensors whose calibrations differ
+    for row in differ:
+        sensor, drift = row['sensor'], row.get('drift')
+        for change in row['changes']:
+            date, path = (change['date'] or '')[:10], change.get('recording') or ''
+            words = change_words(change['parameter'], change['change'], change['sd'])
+            changes.append((sensor, f'{date} {path}'.strip(), words, _LASTING[change['for_good']]))
+        if drift and drift['p_value'] < _DRIFTS:
+            words = change_words(drift['parameter'], drift['per_year'], drift['sd'])
+            changes.append((sensor, '', f'{words} per year', 'drift'))
+        elif not row['changes']:
+            changes.append((sensor, '', 'no step or drift that is significant alone', ''))
     drawings, others = _over_time(store, sensors, differ, odd_names) if drawn_too else ([], 0)
     write_page(store.folder / PAGE, page(
         'fleet', 'Fleet', (), rating_of(known, sensors), heading='Calibrations of a fleet',
         script=False,  # the browser shows the text of a marker that is pointed at
         has_figures=drawn_too, left_out=known.left_out, models=models, most_models=_MOST_MODELS,
-        differ=differ, changes=_changes(differ), over_time=drawings, others=others, most=_MOST,
-        long=_LONG, failed=sum(known.counts[status] for status in ('error', 'unread')),
+        differ=differ, changes=changes, over_time=drawings, others=others,
+        failed=sum(known.counts[status] for status in ('error', 'unread')),
         errors=[(row['recording'], row['error'], row['advice']) for row in known.errors]))
 
 
@@ -391,23 +402,6 @@ def _section(known: OfModel, odd: Sequence[Odd], prior: FleetPrior | None, prefi
             'distribution': distribution, 'shared': shared_effects(known.values),
             'drift': list(_draw_months(f'{prefix}_months', known)) if prefix else [],
             'prior': prior, 'typical': typical}
-
-
-def _changes(sensors: Sequence[Row]) -> Sequence[tuple[str, ...]]:
-    """Return lines about the sensors whose calibrations differ."""
-    rows = list[tuple[str, ...]]()
-    for row in sensors:
-        sensor, drift = row['sensor'], row.get('drift')
-        for change in row['changes']:
-            date, path = (change['date'] or '')[:10], change.get('recording') or ''
-            words = change_words(change['parameter'], change['change'], change['sd'])
-            rows.append((sensor, f'{date} {path}'.strip(), words, _LASTING[change['for_good']]))
-        if drift and drift['p_value'] < _DRIFTS:
-            words = change_words(drift['parameter'], drift['per_year'], drift['sd'])
-            rows.append((sensor, '', f'{words} per year', 'drift'))
-        elif not row['changes']:
-            rows.append((sensor, '', 'no step or drift that is significant alone', ''))
-    return rows
 
 
 def _over_time(store: Store, sensors: Sequence[Row], differ: Sequence[Row],

@@ -391,10 +391,10 @@ def as_text(name: str) -> str:
 
 def _about(found: Input, options: Options, poses: Poses | None, path: Path | None) -> Row:
     """Return the columns about a recording: sensor, model and date."""
-    row: Row = {'recording': found.path, 'version': __version__, 'sensor': UNKNOWN}
+    row: Row = {'recording': found.path, 'version': __version__, 'sensor': UNKNOWN,
+                'sensor_model': ''}
     row['date'], row['date_from'] = date_of(
         found, poses, os.stat(path).st_mtime if path and '://' not in found.path else None)
-    row['sensor_model'] = ''
     try:
         row['sensor'] = sensor_of(found, poses.sensor if poses else '', options.sensor_from)
         if options.model_from:

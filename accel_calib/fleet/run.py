@@ -14,7 +14,7 @@ statistics. The program alone writes what concerns all sensors.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -32,7 +32,7 @@ from .recording import (
     as_folder, content_hash, Input, key_of, on_disk, Options, Row, row_of, schema, unread_row)
 from .sensors import (
     is_damaged, merge_sensor, read_parquet, SENSORS, Store, UNREAD, write_parquet, write_sensors)
-from ..calibration import Calibration, FleetPrior
+from ..calibration import Calibration
 from ..disk import write_atomically
 from ..effects import OwnEffect
 from ..errors import AccelCalibError, InputError, known_error, needing
@@ -94,15 +94,14 @@ class Summary:
     """
     What a run did.
 
-    `counts` are the recordings by status (`STATUS`), `sensors` the rows of all sensors, and
-    `priors` the typical values by model of sensor. `damaged` are damaged files of the results,
-    under their new names; their content was made again.
+    `counts` are the recordings by status (`STATUS`), and `sensors` the rows of all sensors.
+    `damaged` are damaged files of the results, under their new names; their content was made
+    again.
 
     """
 
     counts: Counter[str]
     sensors: tuple[Row, ...]
-    priors: Mapping[str, FleetPrior]
     damaged: tuple[str, ...]
     rating: Rating
 
@@ -154,10 +153,8 @@ def cluster(address: str = '', workers: int | None = None) -> Iterator[Client]:
         yield client
 
 
-class _CtrlC:
-    """Whether Ctrl-C came; one per process, as the signal."""
-
-    came = False
+_ctrl_c = threading.Event()
+"""Whether Ctrl-C came."""
 
 
 @contextmanager
@@ -165,13 +162,13 @@ def _ctrl_c_waits() -> Iterator[None]:
     """Let Ctrl-C wait for `mapped` or the end: within Dask it leaves half-done calls."""
     before = signal.getsignal(signal.SIGINT)
     if before != signal.SIG_IGN:
-        signal.signal(signal.SIGINT, lambda number, frame: setattr(_CtrlC, 'came', True))
+        signal.signal(signal.SIGINT, lambda number, frame: _ctrl_c.set())
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-        if _CtrlC.came:  # whatever else the interruption has caused
-            _CtrlC.came = False
+        if _ctrl_c.is_set():  # whatever else the interruption has caused
+            _ctrl_c.clear()
             raise KeyboardInterrupt
 
 
@@ -240,7 +237,7 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         else:
             path.unlink(missing_ok=True)
         write_fleet_page(store, known, sensors, priors)
-        return Summary(counts, sensors, priors, damaged, rating_of(known, sensors))
+        return Summary(counts, sensors, damaged, rating_of(known, sensors))
 
 
 def _merge(client: Client, store: Store, own: tuple[OwnEffect, ...]) -> list[Row]:
@@ -295,10 +292,10 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
             done.add(future)
         if not waiting:
             return
-        while not done.has_ready() and not _CtrlC.came:
+        while not done.has_ready() and not _ctrl_c.is_set():
             time.sleep(_LOOK_S)
             workers.look()
-        if _CtrlC.came:
+        if _ctrl_c.is_set():
             raise KeyboardInterrupt
         future = next(done)
         batch = waiting.pop(future)

@@ -107,28 +107,20 @@ def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
     figures = [(each.label, f'{short(each.value)} {each.unit}')
                for each in residual_figures(checked or calibration.quality)
                if each.key != 'max_before_mg']
-    left_out = len(residuals.left_out)
     refusal = '' if refinement is None or not refinement.refusal else (
         'the refined calibration must not be used: '
         f'{refinement.refusal[0]}; {refinement.refusal[1]}')
-    refused = refusal if used is not None else ''
     head, rows = _pose_table(residuals, calibration)
     sensor = calibration.sensor and f'sensor {calibration.sensor}'
     return page(
         'calibration', f'{what} of {name}' if name else what,
         (source, sensor, calibration.date and f'fitted {calibration.date}'), rating,
         more='' if used is None else verdict_words(used),
-        key_numbers=[*figures, ('poses used', str(len(residuals.poses_g))),
-                     *([('poses left out', str(left_out))] if left_out else ()),
-                     ('coverage', f'{100.0 * covered:.0f} %')],
+        shown_figures=figures, residuals=residuals, covered=covered, used=used, refusal=refusal,
         searched={} if refinement is None else search_values(refinement, residuals),
-        used=used is not None, refusal=refusal, refused=bool(refused),
         coverage=of_coverage(residuals, covered, None if asked is None else asked.direction),
-        next_pose='' if asked is None else (
-            f'Next pose: {request_words(asked)}.'.replace('..', '.')),
+        next_pose='' if asked is None else request_words(asked),
         before_after=of_before_after(residuals, (checked or calibration.quality).noise_floor_mg),
-        warnings=[*filter(None, [refused]), *calibration.warnings],
-        advice=() if used is None else used.advice,
         left_out=[f'row {row}: {reason}' for row, reason in sorted(residuals.reasons.items())],
         remainder=of_remainder(residuals), head=head, poses=rows, notes=notes,
         **_values(calibration, stored))
@@ -151,15 +143,10 @@ def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str
     """
     calibration, curve = outcome.calibration, outcome.curve
     names = ', '.join(Path(source).name or source for source in sources)
-    low, high = curve.range_c
     return page(
         'thermal', f'Offset over temperature of {calibration.sensor or names}',
         (', '.join(sources), calibration.date and f'fitted {calibration.date}'), outcome.rating,
-        key_numbers=[('range', f'{low:.1f} to {high:.1f} °C'), ('degree', str(curve.degree)),
-                     ('change', f'{short(curve.change_mg)} mg'),
-                     ('residual', f'{short(curve.residual_mg)} mg'),
-                     ('uncertainty up to', f'{short(curve.band_mg)} mg')],
-        drawings=(_draw_axis(curve, axis) for axis in range(3)),
+        curve=curve, drawings=(_draw_axis(curve, axis) for axis in range(3)),
         held_out=[(name or 'none', short(error)) for name, error in curve.held_out_mg.items()],
         notes=notes, **_values(calibration, stored))
 

@@ -42,21 +42,15 @@ _KALIBR: dict[tuple[Kind, str], str] = {
 
 def noise_page(found: NoiseFigures, source: str) -> str:
     """Return the page of the noise of the recording in the file `source`, as HTML."""
-    pairs = [('rest', duration(found.seconds)), ('samples', f'{found.samples:,}'),
-             ('rate', f'{found.rate:.5g} Hz')]
-    if found.temperature is not None:
-        low, high = found.temperature
-        pairs.append(('temperature', f'{low:.1f} to {high:.1f} °C'))
     tables = []
     for kind in found.kinds:
         axes = found.of(kind)
         rows = [(f'{label} [{unit}]', *cells) for label, unit, cells in figure_rows(axes)]
         times = (f'{duration(axis.used[0])} to {duration(axis.used[1])}' for axis in axes)
-        tables.append((kind, ['', *(axis.axis for axis in axes), 'typical'],
-                       [*rows, ('from τ', *times, '')]))
+        tables.append((kind, [axis.axis for axis in axes], [*rows, ('from τ', *times, '')]))
     return page('noise', f'Noise of {Path(source).name or source}', [source], rate_noise(found),
-                key_numbers=pairs, drawings=(_draw_allan(found.of(kind)) for kind in found.kinds),
-                tables=tables, notes=found.notes, needs=need_lines(found),
+                found=found, rest=duration(found.seconds), tables=tables, needs=need_lines(found),
+                drawings=(_draw_allan(found.of(kind)) for kind in found.kinds),
                 kalibr=kalibr_lines(found))
 
 
@@ -243,8 +237,7 @@ def comparison_page(comparison: Comparison, rating: Rating, sources: Sequence[Pa
              short(run.largest_mg), f'{run.p_value:.2g}')
             for label, each, run in zip(labels, calibrations, comparison.runs, strict=True)]
     return page('comparison', f'Comparison of {len(calibrations)} calibrations{sensor}',
-                map(str, sources), rating, history=False, runs=runs, head=(
-                    'run', 'date', 'model', 'RMS [mg]', 'expected [mg]', 'largest [mg]', 'p'),
+                map(str, sources), rating, history=False, runs=runs,
                 drawings=of_parameters(comparison, labels),
                 parameters=list(parameter_rows(comparison)),
                 notes=filter(None, (*comparison.notes, comparison.tilt_words)))
@@ -280,6 +273,5 @@ def history_page(history: History, sources: Sequence[Path],
     names = [each.name.replace('.', ' ') for each in history.parameters]
     return page('comparison', f'History of {len(calibrations)} calibrations{sensor}',
                 [f'{history.labels[0]} to {history.labels[-1]}'], rate_comparison(history.whole),
-                history=True, drawings=of_history(history), changes=changes, runs=moments, head=(
-                    '', 'date', 'file', 'model', '°C', 'residual [mg]', *names),
-                notes=history.notes)
+                history=True, drawings=of_history(history), changes=changes, runs=moments,
+                names=names, notes=history.notes)
