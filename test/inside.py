@@ -88,15 +88,15 @@ from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store, worker
 from accel_calib.session.commands import poses_changed
 from accel_calib.session.conditions import figures, step_of
-from accel_calib.session.poses import Guide, LiveCapture, with_temperature
-from accel_calib.session.settings import capture_settings, changed, default_of
-from accel_calib.session.state import new_sensor, rest_after
+from accel_calib.session.poses import Guide, LiveCapture
+from accel_calib.session.settings import capture_settings, changed
+from accel_calib.session.state import new_sensor
 from accel_calib.session.store import (
     aside, MOST_STEPS, SensorFiles, Store as SensorStore, store_of, writing_advice)
 from accel_calib.session.stream import StreamStatistics, TemperatureHistory
 from accel_calib.session.use import adopt as use_calibration, fit as fit_in_node
 from accel_calib.session.worker import Worker, WorkerProcess
-from accel_calib.stillness import rounding_left
+from accel_calib.stillness import rest_after, rounding_left, with_temperature
 from accel_calib.stillness.chunks import repeated_extremes
 from accel_calib.stillness.trend import _long_run as long_run, excess_of_means, lines, oscillation
 from accel_calib.stored import calibration_yaml, plain_yaml
