@@ -5,18 +5,19 @@
 Rotations as matrices, quaternions, roll, pitch and yaw; directions, and attitudes by name.
 
 Rotations are converted here, because the import of `scipy.spatial` takes 0.2 s and 25 MB: a node
-would load it between two messages.
+would load it between two messages. Static transforms need only the rotations between their frames.
 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import permutations, product
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .errors import InputError
 from .table import Floats
 from .units import rms
 
@@ -204,3 +205,62 @@ def attitude_words(up: Floats) -> str:
     tilt = math.degrees(math.acos(min(abs(float(up[axis])), 1.0)))
     return (f'{words_of(face)} up ({axes_of_signs(face)}), tilted by {tilt:.0f}° so that '
             f'{words_of(np.sign(raised))} ({axes_of_signs(raised)}) rises')
+
+
+_LENGTH_TOLERANCE = 0.01
+"""Largest error of the squared length of a quaternion, as in tf2 of ROS."""
+
+
+@dataclass(frozen=True)
+class StaticTransforms:
+    """A tree of frames: the parent of each frame, and the rotation of vectors to the parent."""
+
+    parents: dict[str, tuple[str, Floats]] = field(default_factory=dict)
+
+    def add(self, parent: str, child: str, quaternion: Sequence[float]) -> bool:
+        """
+        Add a transform, or replace the previous one of this child; return whether it is new.
+
+        The quaternion (x, y, z, w) is that of the rotation of vectors from `child` to `parent`.
+        InputError if a name is empty, the quaternion is not a rotation, or the frames form a loop:
+        the tree is then unchanged.
+
+        """
+        parent, child = parent.removeprefix('/'), child.removeprefix('/')
+        if not (parent and child):
+            raise InputError(f'a static transform from {parent!r} to {child!r} has an empty frame '
+                             'name, expected two names', 'correct the node that publishes it')
+        if child in self._rotations_above(parent):
+            raise InputError(f'the static transform from {parent} to {child} makes a loop, '
+                             f'expected that {child} is not above {parent}',
+                             'correct the node that publishes it, or restart this node if the '
+                             'frames were rearranged')
+        squared = sum(part * part for part in quaternion)
+        if not abs(squared - 1.0) < _LENGTH_TOLERANCE:  # NaN too
+            words = ', '.join(f'{part:g}' for part in quaternion)
+            raise InputError(
+                f'the static transform from {parent} to {child} has the quaternion ({words}) of '
+                f'length {math.sqrt(squared):.3g}, expected length 1',
+                'correct the node that publishes it')
+        rotation = rotation_from_quaternion(quaternion)
+        before = self.parents.get(child)
+        self.parents[child] = (parent, rotation)
+        return before is None or before[0] != parent or not np.array_equal(before[1], rotation)
+
+    def rotation(self, base: str, frame: str) -> Floats | None:
+        """Return the (3, 3) rotation of vectors from `frame` to `base`; None: not connected."""
+        above_base, above = (
+            self._rotations_above(each.removeprefix('/')) for each in (base, frame))
+        for common, mat_common_frame in above.items():
+            if common in above_base:
+                return above_base[common].T @ mat_common_frame
+        return None
+
+    def _rotations_above(self, frame: str) -> dict[str, Floats]:
+        """Return the rotation from a frame to itself and to each frame above it, nearest first."""
+        found: dict[str, Floats] = {frame: np.eye(3)}
+        while frame in self.parents:
+            parent, mat_parent_frame = self.parents[frame]
+            found[parent] = mat_parent_frame @ found[frame]
+            frame = parent
+        return found

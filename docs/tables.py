@@ -31,7 +31,7 @@ from accel_calib.findings import LIMITS  # noqa: E402
 from accel_calib.logs import FORMATS  # noqa: E402
 from accel_calib.logs.names import UNITS, WORDS  # noqa: E402
 from accel_calib.session import CalibratorSettings  # noqa: E402
-from accel_calib.session.settings import default_of, expected  # noqa: E402
+from accel_calib.session.settings import expected  # noqa: E402
 from accel_calib.stored.exports import FORMATS as EXPORTS  # noqa: E402
 from accel_calib.table import COLUMNS  # noqa: E402
 
@@ -125,7 +125,7 @@ def settings() -> Iterator[str]:
     for each in fields(CalibratorSettings):
         words = re.sub(r'([|<*])', r'\\\1', f"{each.metadata['words']} ({expected(each)})")
         live = 'yes' if each.metadata['live'] else ''
-        yield f'| `{each.name}` | `{stated(default_of(each))}` | {words} | {live} |'
+        yield f'| `{each.name}` | `{stated(each.metadata["default"])}` | {words} | {live} |'
 
 
 Tables = Mapping[str, Callable[[], Iterator[str]]]
@@ -148,7 +148,7 @@ def parameters() -> Iterator[str]:
         live = ' *' if each.metadata['live'] else ''
         words = f"{each.metadata['words']} ({expected(each)}){live}"
         yield from wrap(words, 99, initial_indent=COMMENT, subsequent_indent=COMMENT)
-        yield f'    {each.name}: {stated(default_of(each))}'
+        yield f'    {each.name}: {stated(each.metadata["default"])}'
 
 
 def with_tables(text: str, made: Tables = TABLES) -> str:

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from accel_calib.ros.calibrator_node import in_executor, pose_markers, serve
-from accel_calib.ros.declare import (
-    LATCHED, static_transform, StaticTransforms, TOPIC as TF_TOPIC, watch_static)
+from accel_calib.ros.declare import LATCHED, static_transform, TOPIC as TF_TOPIC, watch_static
 from accel_calib.ros.simulator_node import SimulatedImu, SimulatorSettings
 import numpy as np
 from numpy.typing import NDArray

@@ -19,13 +19,12 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 from accel_calib.session import CalibratorSettings
-from inside import default_of
 import pytest
 from shared import table
 import yaml
 
 ROOT = Path(__file__).parent.parent
-DEFAULTS = {each.name: default_of(each) for each in fields(CalibratorSettings)}
+DEFAULTS = {each.name: each.metadata['default'] for each in fields(CalibratorSettings)}
 
 
 class Context:

@@ -34,7 +34,7 @@ def push_all(live: LiveCapture, readings: Any, *, start: float = 0.0, rate: floa
 def monitored(stored: Stored) -> tuple[Any, Any]:
     """Return a calibration, and a sensor that uses it."""
     calibration = read_calibration(stored())
-    return calibration, new_sensor(SETTINGS, MPS2).adopt(calibration, SETTINGS)
+    return calibration, new_sensor(SETTINGS, MPS2).adopt(calibration)
 
 
 def dwell(time: float, direction: Any, count: float = 50.0) -> Dwell:
@@ -169,9 +169,9 @@ def test_change_is_reported_during_the_third_rest_and_survives_a_new_level(store
     assert sensor.drift.change is not None
     assert sensor.drift.count == 6
     flat = calibration.predict(np.array([[0.0, 0.6, 0.8]]) * GRAVITY)[0]
-    sensor = sensor.adopt(level(calibration, flat, 'ros'), SETTINGS)
+    sensor = sensor.adopt(level(calibration, flat, 'ros'))
     assert sensor.drift.change is not None
-    sensor = sensor.adopt(None, SETTINGS)
+    sensor = sensor.adopt(None)
     assert sensor.drift is None
 
 

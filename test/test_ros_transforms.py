@@ -8,10 +8,10 @@ import re
 from typing import Any
 
 from accel_calib.errors import InputError
+from accel_calib.geometry import StaticTransforms
 from builtin_interfaces.msg import Time
 from inside import quaternion_of, rotation_from_rpy
-from inside_ros import (
-    LATCHED, publish_static, static_transform, StaticTransforms, TF_TOPIC, watch_static)
+from inside_ros import LATCHED, publish_static, static_transform, TF_TOPIC, watch_static
 import numpy as np
 import pytest
 

@@ -30,7 +30,7 @@ from .quality import (
     deviations_g, errors_after, errors_before, fit_findings, gated, has_usual_gains, in_g,
     LARGEST_OFFSET_G, OF_A_FIT, Outside, outside, quality_of, record_of, stated_uncertainty,
     uncertainty_g, Verification, verify, with_rest_noise)
-from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise
+from .rest_noise import gyro_bias_of, gyro_bias_of_rest, GyroBias, sample_noise_of, SampleNoise
 from .thermal import Curve, curve_of, thermal_alone, with_curve, without_curve
 
 __all__ = ['CLIPPED', 'ENOUGH', 'FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MODELS',
@@ -41,9 +41,10 @@ __all__ = ['CLIPPED', 'ENOUGH', 'FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G',
            'dilution', 'directions_in', 'directions_of', 'error_left_in', 'errors_after',
            'errors_before', 'fit_findings', 'fit_partial', 'fit_poses', 'fit_unknown',
            'fit_with_fleet', 'flat_direction', 'free_parameters', 'gated', 'gyro_bias_of',
-           'has_usual_gains', 'identifiability', 'in_frame', 'in_g', 'level', 'level_by_rows',
-           'lies_in_cone', 'lies_in_plane', 'mounting_only', 'next_pose', 'on_topics', 'only_norm',
-           'outside', 'plan_refinement', 'plan_session', 'posterior', 'quality_of', 'record_of',
-           'refuse_if_unfit', 'rejected_by', 'sample_noise_of', 'set_heading', 'sound_rows',
-           'stated_uncertainty', 'sure_rows', 'thermal_alone', 'uncertainty_g', 'verify',
-           'with_curve', 'with_given_mounting', 'with_rest_noise', 'without_curve']
+           'gyro_bias_of_rest', 'has_usual_gains', 'identifiability', 'in_frame', 'in_g', 'level',
+           'level_by_rows', 'lies_in_cone', 'lies_in_plane', 'mounting_only', 'next_pose',
+           'on_topics', 'only_norm', 'outside', 'plan_refinement', 'plan_session', 'posterior',
+           'quality_of', 'record_of', 'refuse_if_unfit', 'rejected_by', 'sample_noise_of',
+           'set_heading', 'sound_rows', 'stated_uncertainty', 'sure_rows', 'thermal_alone',
+           'uncertainty_g', 'verify', 'with_curve', 'with_given_mounting', 'with_rest_noise',
+           'without_curve']

@@ -51,6 +51,7 @@ import numpy as np
 from numpy.typing import NDArray
 import scipy
 
+from ..stillness import Dwell
 from ..table import Floats, Poses, range_of, Record
 from ..units import NORMAL_95, SIGMA_OF_MAD
 
@@ -59,6 +60,9 @@ LARGEST_BIAS = 1.0
 
 LEAST_RESTS = 2
 """Fewest rests that show how much the bias differs from rest to rest."""
+
+_LARGEST_AT_REST = 0.1
+"""Largest bias of a gyro from one rest [rad/s]; MEMS gyros have up to 5 °/s."""
 
 _LARGEST_SD = 0.05
 """Largest standard deviation of a useful bias [rad/s]; it is larger if the sensor was turned."""
@@ -207,6 +211,18 @@ def gyro_bias_of(poses: Poses) -> GyroBias | None:
     limits = range_of(rests, 'temperature')
     mean = float(np.clip(rests['temperature'].mean(), *limits))
     return GyroBias(bias, sd, len(rests), mean, slope, temperatures=limits)
+
+
+def gyro_bias_of_rest(rest: Dwell) -> GyroBias | None:
+    """Return the bias of the gyro from one rest; None without a plausible angular rate."""
+    rate = rest.context.get('rate')
+    if rate is None or not np.all(np.isfinite(rest.rate_std)) or np.any(
+            np.abs(rate) > _LARGEST_AT_REST):
+        return None
+    temperature = float(np.asarray(rest.context.get('temperature', math.nan)))
+    known = () if math.isnan(temperature) else (temperature, temperature)
+    return GyroBias(np.asarray(rate, float), rest.rate_std / math.sqrt(rest.count), rests=1,
+                    temperature=temperature, slope=np.zeros(3), temperatures=known)
 
 
 def _find_agreeing(rests: Poses, noise: Floats) -> NDArray[np.bool_]:

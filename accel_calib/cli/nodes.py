@@ -38,7 +38,7 @@ from ..stillness import CaptureSettings
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..ros.watch import Show
+    from ..ros.client import Show
     from ..session import Progress
 
 _ERRORS = {'vector_mg': 'error of a, RMS [mg]', 'rms_mg': 'error of |a|, RMS [mg]',
@@ -99,7 +99,7 @@ def run_live(args: argparse.Namespace) -> Done:
 def run_demo(args: argparse.Namespace) -> Done:
     """Run simulator and calibrator in separate processes."""
     try:
-        from ..ros.demo import demonstrate, demonstrate_page
+        from ..ros.client import demonstrate, demonstrate_page
     except ImportError as err:
         raise InputError(f'ROS 2 is not installed ({err}), but the demonstration needs it',
                          NEEDS_ROS) from err
@@ -202,16 +202,16 @@ def run_watch(args: argparse.Namespace) -> Done:
     """Show the progress until the user ends it."""
     with ended() as is_over:
         try:
-            from ..ros import watch
+            from ..ros import client
         except ImportError as err:
             raise InputError(f'ROS 2 is not installed ({err}), but the command needs it',
                              NEEDS_ROS) from err
         for_ros = [args.command, *args.for_ros]
         if not args.once:
             with _open_screen(args.bell) as show:
-                watch.watch(args.node, show, is_over, for_ros)
+                client.watch(args.node, show, is_over, for_ros)
             return Done()
-        node, progress = watch.current(args.node, is_over, for_ros)
+        node, progress = client.current(args.node, is_over, for_ros)
         if progress is not None and sys.stdout.isatty():
             Output().print(screen(node, progress))
         elif progress is not None:

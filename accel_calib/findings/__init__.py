@@ -28,16 +28,16 @@ from .figures import (
     refinement_json, residual_figures, scale_of)
 from .rating import rate, rate_comparison, rate_fleet, rate_noise, rate_verification
 from .words import (
-    advice_lines, angle_words, base_words, chance_words, mounting_figures, mounting_words,
-    NOTHING_TO_PLAN, odds_words, outside_words, place_words, plan_lines, request_words,
-    rival_words, USES_LIMIT, value_words, verdict_words)
+    advice_lines, angle_words, base_words, chance_words, difference_words, mounting_figures,
+    mounting_words, NOTHING_TO_PLAN, odds_words, outside_words, place_words, plan_lines,
+    request_words, rival_words, short_verdict, USES_LIMIT, value_words, verdict_words)
 from ..finding import Rating
 
 __all__ = ['CROSS', 'GAINS', 'GOOD_MG', 'LIMITS', 'NOTHING_TO_PLAN', 'OFFSETS', 'USES_LIMIT',
            'Expected', 'Figure', 'Limit', 'Outlook', 'Rating', 'advice_lines', 'angle_words',
-           'base_words', 'calibration_json', 'chance_words', 'change_words',
+           'base_words', 'calibration_json', 'chance_words', 'change_words', 'difference_words',
            'effect_figures', 'figures_of', 'in_words', 'linear_figures', 'mounting_figures',
            'mounting_words', 'odds_words', 'outlook', 'outside_words', 'place_words', 'plan_lines',
            'rate', 'rate_comparison', 'rate_fleet', 'rate_noise', 'rate_verification',
            'rating_json', 'refinement_json', 'request_words', 'residual_figures', 'rival_words',
-           'scale_of', 'value_words', 'verdict_words']
+           'scale_of', 'short_verdict', 'value_words', 'verdict_words']

@@ -12,10 +12,11 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from ..calibration import Combination, ENOUGH, NextPose, Outside, PlannedPose, PosePlan
+from ..calibration import (
+    Calibration, Combination, ENOUGH, NextPose, Outside, PlannedPose, PosePlan)
 from ..effects import (
     CHANGES, EffectKey, entry_of, shown_name, TO_SEPARATE, unit_of, value_unit, variable_words)
-from ..geometry import attitude_words, axes_of_signs, quaternion_of, rpy_of, words_of
+from ..geometry import angle_of, attitude_words, axes_of_signs, quaternion_of, rpy_of, words_of
 from ..table import column_of, Floats, is_quantity
 from ..text import counted, listed, with_minus, with_sd
 from ..units import MG
@@ -158,6 +159,17 @@ def verdict_words(result: Refinement) -> str:
         words += (' The noise of the poses is not known (no std and count), so their scatter is '
                   'taken as the noise.')
     return words
+
+
+def short_verdict(result: Refinement) -> str:
+    """Return the verdict as a part of a sentence, with the effects and their rivals."""
+    names = [shown_name(step.name) + (f' (or {", ".join(rival_words(step))})' if step.rivals
+                                      else '') for step in result.steps]
+    found, verb = ' and '.join(names), 's' if len(names) == 1 else ''
+    return {'no_gap': 'no gap beyond the noise', 'explained': f'{found} explain{verb} the gap',
+            'described': f'{found} describe{verb} the gap', 'drifts': 'the offset drifts',
+            'unexplained': f'a gap remains beyond {found}' if names else
+            'a gap remains that no effect explains'}[result.verdict]
 
 
 def base_words(result: Refinement) -> str:
@@ -340,6 +352,21 @@ def angle_words(rotation: Floats) -> str:
     found = mounting_figures(rotation, '')
     return ', '.join(f'{name} {math.degrees(found[name]):.2f}°' for name in (
         'roll', 'pitch', 'yaw'))
+
+
+def difference_words(before: Calibration | None, after: Calibration) -> str:
+    """Return what changes with a new calibration, as one line; empty without an earlier one."""
+    if before is None:
+        return ''
+    offset = after.units.to_g(after.offset - before.offset) * MG
+    gain = 100.0 * (np.linalg.solve(before.gain, after.gain) - np.eye(3))
+    angle = angle_of(before.rotation.T @ after.rotation)
+    effects = set(before.model.effects) ^ set(after.model.effects)
+    words = [f'offset by ({", ".join(f"{part:+.2f}" for part in offset)}) mg',
+             f'gain by up to {np.max(np.abs(gain)):.3f} %', f'mounting by {angle:.2f}°']
+    words += [f'{"with" if name in after.model.effects else "without"} {name}'
+              for name in sorted(effects, key=str)]
+    return f'changes {", ".join(words)}'
 
 
 # ----------------------------------------------------------------------------- ranges

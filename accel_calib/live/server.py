@@ -145,6 +145,8 @@ class PageServer:
 
     Attributes
     ----------
+    exchange : Exchange
+        What the page shows, and its answers.
     token : str
         What commands and exports need.
     viewers : dict of Viewer to Connection
@@ -155,7 +157,7 @@ class PageServer:
     """
 
     def __init__(self, exchange: Exchange, host: str, port: int) -> None:
-        self._exchange, self._host, self._port = exchange, host, port
+        self.exchange, self._host, self._port = exchange, host, port
         self.token = secrets.token_urlsafe(16)
         self._loop: asyncio.AbstractEventLoop | None = None
         self._over = asyncio.Event()
@@ -189,7 +191,7 @@ class PageServer:
                 f'the live page cannot be served at {self._host}, port {self._port}: '
                 f'{error.strerror or error}', 'choose an address of this machine, and a port '
                 'above 1023') from error
-        self._exchange.show = self.show
+        self.exchange.show = self.show
 
     def close(self) -> None:
         """Close all viewers, and stop serving."""
@@ -276,7 +278,7 @@ class PageServer:
         self._reported[what] += 1
         if self._filter.passes(what, _QUIET_S):
             words = f'the live page {what} ({self._reported[what]} so far)'
-            self._exchange.call_soon(lambda: self._exchange.log('warning', words))
+            self.exchange.call_soon(lambda: self.exchange.log('warning', words))
 
     def _take(self, message: Message) -> None:
         """Show a message, unless the newest one of its kind is equal."""
@@ -319,7 +321,7 @@ class PageServer:
         """Return a file of the page, the calibration page, or an export."""
         export = path.removeprefix('/export/')
         if path == '/calibration.html':
-            success, text = await self._ask(self._exchange.page)
+            success, text = await self._ask(self.exchange.page)
             if not success:
                 return web.Response(status=404, text=f'{text}\n')
             allowed = {'Content-Security-Policy': f"{policy()}; frame-ancestors 'self'"}
@@ -334,7 +336,7 @@ class PageServer:
         if kind.lower() != 'bearer' or not self._is_token(token.strip()):
             return web.Response(status=401, headers={'WWW-Authenticate': 'Bearer'}, text=(
                 f'the token is missing or wrong; {_ITS_LINK}\n'))
-        _, found = await self._ask(partial(self._exchange.export, export))
+        _, found = await self._ask(partial(self.exchange.export, export))
         if isinstance(found, str):
             return web.Response(status=409, text=f'{found}\n')
         return web.Response(
@@ -345,7 +347,7 @@ class PageServer:
         """Return success and answer of a function of the exchange."""
         answered: Future[Any] = Future()
         answered.set_running_or_notify_cancel()  # its answer comes even if nobody waits any more
-        self._exchange.call_soon(lambda: ask(lambda *found: answered.set_result(found)))
+        self.exchange.call_soon(lambda: ask(lambda *found: answered.set_result(found)))
         return await asyncio.wrap_future(answered)
 
     async def _stream(self, request: web.BaseRequest, connection: Connection
@@ -362,7 +364,7 @@ class PageServer:
         await socket_.prepare(request)
         connection.stage = 2
         viewer = Viewer(self.board, socket_, connection.abort,
-                        lambda command: self._ask(partial(self._exchange.ask, command)))
+                        lambda command: self._ask(partial(self.exchange.ask, command)))
         try:
             await viewer.run(partial(self._admit, connection))
         finally:

@@ -6,8 +6,8 @@ The ROS nodes. They only convert messages, call other parts, and publish the res
 
 `calibrator_node` and `simulator_node` are the nodes; `run` has the executables, which start, spin
 and end them. In the calibrator, `stream` processes Imu messages. `declare` declares parameters,
-services, the quality of service and static transforms. `watch` receives the progress, and `demo`
-runs both nodes.
+services, the quality of service and static transforms. `client` receives the progress of a node,
+and runs both nodes for a demonstration.
 
 All callbacks run in one thread, and only callbacks use the session.
 

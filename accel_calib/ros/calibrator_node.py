@@ -56,7 +56,6 @@ from ..table import Floats
 if TYPE_CHECKING:
     from rclpy.lifecycle import LifecycleState
 
-    from ..live.exchange import Exchange
     from ..live.server import PageServer
 
 _PROGRESS_EVERY = 0.25
@@ -145,8 +144,7 @@ class Calibrator:
             node.create_publisher(kind, topic, STREAM, qos_overriding_options=self._overrides)
             for kind, topic in ((Imu, 'imu/data_calibrated'), (Imu, '~/preview'),
                                 (Vector3Stamped, '~/linear_acceleration'))], self._on_samples)
-        self._page: Exchange | None = None
-        self._server: PageServer | None = None
+        self._page: PageServer | None = None
         self._still.publish(Bool(data=False))
         for name in COMMANDS:
             serve(node, name, partial(run, self.session, name), self._worker)
@@ -172,12 +170,12 @@ class Calibrator:
             check_installed()
             from ..live.exchange import Exchange, PERIOD
             from ..live.server import PageServer
-            page = Exchange(self.session, self._worker, self._call_soon)
-            server = PageServer(page, settings.web_host, settings.web_port)
-            server.start()
-            self._page, self._server = page, server
-            self._worker.log('info', server.announce())
-            node.create_timer(PERIOD, lambda: page.show_progress(self.stream.newest),
+            exchange = Exchange(self.session, self._worker, self._call_soon)
+            page = PageServer(exchange, settings.web_host, settings.web_port)
+            page.start()
+            self._page = page
+            self._worker.log('info', page.announce())
+            node.create_timer(PERIOD, lambda: exchange.show_progress(self.stream.newest),
                               clock=self._steady)
         except AccelCalibError as error:
             self._worker.log('error', str(error))
@@ -210,7 +208,7 @@ class Calibrator:
             array.header.stamp = node.get_clock().now().to_msg()
             self._diagnostics.publish(array)
         if self._page is not None:
-            self._page.show_state()
+            self._page.exchange.show_state()
 
     def _status(self, check: Check, shown: Iterable[tuple[str, str]] = ()) -> DiagnosticStatus:
         return DiagnosticStatus(
@@ -251,7 +249,7 @@ class Calibrator:
 
     def _show(self, event: Event) -> None:
         if self._page is not None:
-            self._page.show_event(event)
+            self._page.exchange.show_event(event)
         log, calibration = self._node.get_logger(), self.session.sensor.calibration
         match event:  # rclpy needs a separate line of code for each severity
             case Log('error', words):
@@ -278,9 +276,8 @@ class Calibrator:
     def close(self) -> None:
         """Finish writing, and release the files."""
         self._node.remove_on_set_parameters_callback(self._followed)
-        self._page = None
-        if self._server is not None:
-            self._server.close()
+        if self._page is not None:
+            self._page.close()
         self._worker.close()
         self.session.close()
 

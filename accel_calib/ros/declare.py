@@ -15,13 +15,11 @@ have no leading slash.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, fields
-import math
+from collections.abc import Callable, Iterable
+from dataclasses import fields
 from typing import Any, TYPE_CHECKING
 
 from geometry_msgs.msg import Quaternion, TransformStamped
-import numpy as np
 from rcl_interfaces.msg import (
     FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult)
 from rclpy.exceptions import InvalidParameterValueException
@@ -29,8 +27,8 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from ..errors import InputError
-from ..geometry import quaternion_of, rotation_from_quaternion
-from ..session import changed, default_of, expected, Settings
+from ..geometry import quaternion_of, StaticTransforms
+from ..session import changed, expected, Settings
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -47,7 +45,7 @@ def declared(node: Node, kind: type[Settings], *, fixed: bool = True) -> Setting
     """
     try:
         for each in fields(kind):
-            default, limits = default_of(each), each.metadata['limits']
+            default, limits = each.metadata['default'], each.metadata['limits']
             descriptor = ParameterDescriptor(  # for `ros2 param describe` and rqt
                 name=each.name, description=each.metadata['words'],
                 type=Parameter.Type.from_parameter_value(default).value,
@@ -168,9 +166,6 @@ _ALL_STATIC = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE,
                          durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Each publisher of static transforms keeps its own last messages."""
 
-_LENGTH_TOLERANCE = 0.01
-"""Largest error of the squared length of a quaternion, as in tf2."""
-
 _INSTEAD = {'base_frame': 'set mounting_rpy instead', 'publish_tf': 'set publish_tf to false'}
 
 
@@ -183,61 +178,6 @@ def needs_tf2(parameter: str) -> Any:
             f'the parameter {parameter} needs the package tf2_msgs, which is not installed',
             f'install ros-jazzy-tf2-msgs, or {_INSTEAD[parameter]}') from error
     return TFMessage
-
-
-@dataclass(frozen=True)
-class StaticTransforms:
-    """A tree of frames: the parent of each frame, and the rotation of vectors to the parent."""
-
-    parents: dict[str, tuple[str, Floats]] = field(default_factory=dict)
-
-    def add(self, parent: str, child: str, quaternion: Sequence[float]) -> bool:
-        """
-        Add a transform, or replace the previous one of this child; return whether it is new.
-
-        The quaternion (x, y, z, w) is that of the rotation of vectors from `child` to `parent`.
-        InputError if a name is empty, the quaternion is not a rotation, or the frames form a loop:
-        the tree is then unchanged.
-
-        """
-        parent, child = parent.removeprefix('/'), child.removeprefix('/')
-        if not (parent and child):
-            raise InputError(f'a static transform from {parent!r} to {child!r} has an empty frame '
-                             'name, expected two names', 'correct the node that publishes it')
-        if child in self._rotations_above(parent):
-            raise InputError(f'the static transform from {parent} to {child} makes a loop, '
-                             f'expected that {child} is not above {parent}',
-                             'correct the node that publishes it, or restart this node if the '
-                             'frames were rearranged')
-        squared = sum(part * part for part in quaternion)
-        if not abs(squared - 1.0) < _LENGTH_TOLERANCE:  # NaN too
-            words = ', '.join(f'{part:g}' for part in quaternion)
-            raise InputError(
-                f'the static transform from {parent} to {child} has the quaternion ({words}) of '
-                f'length {math.sqrt(squared):.3g}, expected length 1',
-                'correct the node that publishes it')
-        rotation = rotation_from_quaternion(quaternion)
-        before = self.parents.get(child)
-        self.parents[child] = (parent, rotation)
-        return before is None or before[0] != parent or not np.array_equal(before[1], rotation)
-
-    def rotation(self, base: str, frame: str) -> Floats | None:
-        """Return the (3, 3) rotation of vectors from `frame` to `base`; None: not connected."""
-        above_base, above = (
-            self._rotations_above(each.removeprefix('/')) for each in (base, frame))
-        for common, mat_common_frame in above.items():
-            if common in above_base:
-                return above_base[common].T @ mat_common_frame
-        return None
-
-    def _rotations_above(self, frame: str) -> dict[str, Floats]:
-        """Return the rotation from a frame to itself and to each frame above it, nearest first."""
-        found: dict[str, Floats] = {frame: np.eye(3)}
-        while frame in self.parents:
-            parent, mat_parent_frame = self.parents[frame]
-            found[parent] = mat_parent_frame @ found[frame]
-            frame = parent
-        return found
 
 
 def watch_static(node: Node, on_change: Callable[[], None]) -> StaticTransforms:

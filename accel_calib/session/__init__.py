@@ -19,7 +19,7 @@ from .conditions import (
     APART, Check, conditions, diagnostics, figures, next_step, Progress, progress, words_of_state)
 from .session import BATCH, Session
 from .settings import (
-    CalibratorSettings, changed, columns_of, default_of, expected, parameter, Settings, WEB_PORT)
+    CalibratorSettings, changed, columns_of, expected, parameter, Settings, WEB_PORT)
 from .state import Surroundings, title
 from .store import ros_home
 from .stream import Around
@@ -30,7 +30,7 @@ from .worker import (
 __all__ = ['APART', 'BATCH', 'BUTTONS', 'COMMANDS', 'WEB_PORT', 'Answer', 'Around',
            'CalibratorSettings', 'CallSoon', 'Check', 'Compute', 'Event', 'Files', 'Log',
            'Mounting', 'Progress', 'Result', 'Session', 'Settings', 'Severity', 'ShowPoses',
-           'Step', 'Still', 'Surroundings', 'Task', 'Throttle', 'Worker',
-           'WorkerProcess', 'answered', 'changed', 'columns_of', 'conditions', 'default_of',
-           'diagnostics', 'enable', 'expected', 'figures', 'next_step', 'nothing', 'parameter',
-           'progress', 'ros_home', 'run', 'title', 'words_of_state']
+           'Step', 'Still', 'Surroundings', 'Task', 'Throttle', 'Worker', 'WorkerProcess',
+           'answered', 'changed', 'columns_of', 'conditions', 'diagnostics', 'enable', 'expected',
+           'figures', 'next_step', 'nothing', 'parameter', 'progress', 'ros_home', 'run', 'title',
+           'words_of_state']

@@ -16,21 +16,23 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 from dataclasses import replace
 from functools import partial
+import math
 from typing import Any
 
 import numpy as np
 
 from . import use
 from .conditions import next_words, thermometer_words
-from .state import gyro_bias_of_rest, Sensor, State
+from .state import Sensor, State
 from .store import writing_advice
-from .use import adopt, change_words, Fitted, Holder, rate, show_poses
+from .use import adopt, Fitted, Holder, rate, show_poses
 from .worker import Compute, Files, nothing, Parse, Part, Task
 from ..calibration import (
-    Calibration, fit_partial, level, mounting_only, plan_session, set_heading as with_heading)
+    Calibration, fit_partial, gyro_bias_of_rest, level, mounting_only, plan_session,
+    set_heading as with_heading)
 from ..effects import Model
 from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
-from ..findings import angle_words
+from ..findings import angle_words, difference_words
 from ..pipeline import is_partial
 from ..stillness import Dwell, poses_from
 from ..text import counted, now
@@ -259,7 +261,7 @@ def _mount(state: State, calibration: Calibration, words: str, rest: Dwell | Non
             raise InputError('this pose differs by more than 10° of tilt from the mounting in '
                              'mounting_rpy or base_frame', 'place the robot level, or correct the '
                              'given mounting and restart the node')
-    details = [change_words(state.sensor.present, calibration), *(
+    details = [difference_words(state.sensor.present, calibration), *(
         each.words for each in calibration.noted if each.kind in ('flat_pose', 'heading'))]
     return Fitted(calibration, f'{words}; {angle_words(calibration.rotation)}', details,
                   refinement=state.sensor.refinement)
@@ -280,7 +282,7 @@ def _rest(state: State) -> Dwell:
     rest = live.detector.current()
     if rest is not None:
         return rest
-    length = statistics.length_g(state.units)
+    length = math.nan if state.units.is_native else statistics.length / state.units.per_g
     if abs(length - 1.0) > settings.still_norm_tolerance:
         raise InputError(f'|a| is {length:.3g} g, expected about 1 g at rest',
                          'hold the sensor still; if it is still, restart the node with the '
@@ -333,7 +335,7 @@ def undo(session: Holder) -> Task:
     session.change_sensor(fitted_poses=0)
     if calibration is None:
         return 'there is no calibration any more, as before the first fit'
-    changes = '' if before is None else f'; {change_words(before, calibration)}'
+    changes = '' if before is None else f'; {difference_words(before, calibration)}'
     return f'the calibration of {calibration.date or "unknown date"} is in use{changes}'
 
 

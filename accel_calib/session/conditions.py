@@ -285,7 +285,8 @@ def _check_stream(state: State) -> list[Finding]:
             f'{", ".join(names)}; expected one sensor: stop the others, or give each sensor its '
             'own topic; a driver that was killed disappears after about 20 s')
     found['stamps'] = statistics.stamp_fault
-    length, size = statistics.length_g(units), statistics.length
+    size = statistics.length
+    length = math.nan if units.is_native else size / units.per_g
     is_wrong = length < _LIKELY_G[0] or length > _LIKELY_G[1]  # not if it is NaN
     if is_wrong:
         likely = next((name for name, low, high in _UNITS if low < size < high), 'native')

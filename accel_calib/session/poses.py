@@ -37,15 +37,13 @@ from ..calibration import lies_in_cone, NextPose, PlannedPose, SessionPlan
 from ..finding import Finding
 from ..geometry import ATTITUDES, axes_of_signs, SIGNED_AXES, TAKEN, unit
 from ..stillness import (
-    account_of, CaptureSettings, check_measured, Dwell, poses_from, Rest, select, StillDetector)
+    account_of, CaptureSettings, check_measured, Dwell, dwells_of, overlap, poses_from, Rest,
+    select, StillDetector, with_temperature)
 from ..table import CONTEXT, Floats, Poses
 from ..units import MG, Units
 
 _SEPARATE = 64
 """Number of dwells that can be undone one by one; older dwells are merged permanently."""
-
-_SAME_TEMPERATURE = 120.0
-"""Rests within this time are assumed to have the same temperature [s]."""
 
 _BAND = 5.0
 """Poses with a larger difference of temperature are not merged [°C]; ~/refine needs both."""
@@ -152,18 +150,7 @@ class LiveCapture:
 
     def add_stored(self, poses: Poses) -> None:
         """Insert stored poses before the others, each with an orientation of its own."""
-        stored, unknown = [], np.full(3, np.nan)
-        for k in range(len(poses)):
-            row = {key: poses[key][k] for key in poses.columns}
-            time, count = float(row.get('time', 0.0)), float(row.get('count', 1.0))
-            stored.append(Dwell(
-                start=time, end=time, time=time, mean=row['reading'],
-                std=row.get('std', np.zeros(3)), count=count, samples=max(1, round(count)),
-                context={key: row[key] for key in (*CONTEXT, 'rate', *poses.quantities)
-                         if key in row and np.all(np.isfinite(row[key]))},
-                orientation=-1 - k, doubtful=bool(row.get('doubtful', False)),
-                rate_std=row.get('rate_std', unknown), at_limit=bool(row.get('at_limit', False))))
-        self._earlier[:0] = stored
+        self._earlier[:0] = dwells_of(poses)
 
     def put(self, dwell: Dwell, *, ended: bool) -> None:
         """Add the pose of a rest, or replace its provisional one; provisional until it `ended`."""
@@ -302,25 +289,6 @@ class LiveCapture:
                 if each.start in moved and not each.doubtful:
                     self._dwells[k], doubted = replace(each, doubtful=True), doubted + 1
         return Change(last if latest else None, tuple(ended), bool(captured or doubted), doubted)
-
-
-def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
-    """Return dwells with missing temperatures set to that of the nearest one; tables need all."""
-    known = [dwell for dwell in dwells if 'temperature' in dwell.context]
-    found, times = [], np.array([dwell.time for dwell in known])
-    for dwell in dwells:
-        away = np.abs(times - dwell.time)
-        is_near = np.min(away, initial=np.inf) <= _SAME_TEMPERATURE
-        if is_near and 'temperature' not in dwell.context:
-            warm = known[int(np.argmin(away))].context['temperature']
-            dwell = replace(dwell, context={**dwell.context, 'temperature': warm})
-        found.append(dwell)
-    return found
-
-
-def overlap(one: Dwell | Rest, other: Dwell) -> bool:
-    """Return whether two dwells overlap in time; they are then the same rest."""
-    return one.start <= other.end and other.start <= one.end
 
 
 # ----------------------------------------------------------------------------- the next pose

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, Field, field, fields, MISSING, replace
+from dataclasses import dataclass, Field, field, fields, replace
 import math
 from typing import Any, TYPE_CHECKING, TypeVar
 
@@ -58,16 +58,11 @@ def parameter(default: Any, words: str, *, limits: tuple[float, float] | None = 
         Whether it can be set while the node runs.
 
     """
-    about = {'words': words, 'limits': limits, 'choices': choices, 'live': live}
+    about = {'default': default, 'words': words, 'limits': limits, 'choices': choices,
+             'live': live}
     if isinstance(default, list):
         return field(default_factory=lambda: list(default), metadata=about)
     return field(default=default, metadata=about)
-
-
-def default_of(given: Field[Any]) -> Any:
-    """Return the default value of a field."""
-    factory = given.default_factory
-    return given.default if factory is MISSING else factory()
 
 
 _ACCEPTED: dict[type, tuple[type, ...]] = {
@@ -78,7 +73,7 @@ def expected(given: Field[Any]) -> str:
     """Return a text about the values that a parameter accepts."""
     if given.metadata['choices']:
         return 'one of ' + ', '.join(given.metadata['choices'])
-    default = default_of(given)
+    default = given.metadata['default']
     if isinstance(default, list):
         kind = 'strings' if isinstance(default[0], str) else f'{len(default)} numbers'
         return f'a list of {kind}'
@@ -97,7 +92,7 @@ def changed(settings: Settings, values: Mapping[str, Any]) -> Settings:
     """
     known, accepted = {each.name: each for each in fields(settings)}, {}
     for name in filter(known.__contains__, values):
-        value, default, found = values[name], default_of(known[name]), None
+        value, default, found = values[name], known[name].metadata['default'], None
         choices, limits = known[name].metadata['choices'], known[name].metadata['limits']
         kind = type(default)
         if kind is list:

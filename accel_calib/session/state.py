@@ -21,16 +21,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
-from typing import Any
 
 import numpy as np
 
-from .poses import Guide, LiveCapture, LONG_REST, overlap
+from .poses import Guide, LiveCapture, LONG_REST
 from .settings import CalibratorSettings, capture_settings, columns_of
 from .store import SensorFiles
 from .stream import Around, StreamStatistics, TemperatureHistory
 from ..calibration import (
-    Calibration, GyroBias, on_topics, Outside, outside, SampleNoise, with_given_mounting)
+    Calibration, gyro_bias_of_rest, GyroBias, on_topics, Outside, outside, SampleNoise,
+    with_given_mounting)
 from ..comparison import compared, Drift, rest_errors
 from ..effects import Context, OwnEffect
 from ..errors import InputError
@@ -38,7 +38,7 @@ from ..finding import Finding
 from ..findings import mounting_words, Rating
 from ..messages import Known, OneReading, output_scale, Triple
 from ..refinement import Refinement
-from ..stillness import Dwell
+from ..stillness import Dwell, overlap, rest_after
 from ..table import Floats
 from ..units import FrameName, Units
 
@@ -47,9 +47,6 @@ _SHORT_REST = 30.0
 
 _NONE = np.zeros((1, 3))
 _AT_REST: Triple = (0.0, 0.0, 0.0)
-
-_LARGEST_BIAS = 0.1
-"""Largest bias of a gyro [rad/s]; MEMS gyros have up to 5 °/s."""
 
 _LARGEST_BIAS_STEP = 0.02
 """Largest change of a stored bias from rest to rest [rad/s]."""
@@ -263,33 +260,6 @@ class Sensor:
 def new_sensor(settings: CalibratorSettings, units: Units) -> Sensor:
     """Return a sensor without poses and calibration."""
     return Sensor(LiveCapture(capture_settings(settings), units, columns_of(settings)))
-
-
-def gyro_bias_of_rest(rest: Dwell) -> GyroBias | None:
-    """Return the bias of the gyro from one rest; None without a plausible angular rate."""
-    rate = rest.context.get('rate')
-    if rate is None or not np.all(np.isfinite(rest.rate_std)) or np.any(
-            np.abs(rate) > _LARGEST_BIAS):
-        return None
-    temperature = float(np.asarray(rest.context.get('temperature', math.nan)))
-    known = () if math.isnan(temperature) else (temperature, temperature)
-    return GyroBias(np.asarray(rate, float), rest.rate_std / math.sqrt(rest.count), rests=1,
-                    temperature=temperature, slope=np.zeros(3), temperatures=known)
-
-
-def rest_after(part: Dwell, whole: Dwell) -> Dwell:
-    """Return the remainder of a rest after a part of it, with the noise of the part."""
-    samples = whole.samples - part.samples
-    share = samples / whole.samples
-
-    def mean(before: Any, all_of_it: Any) -> Any:
-        return (all_of_it - (1.0 - share) * before) / share
-
-    context = {key: mean(part.context.get(key, value), value)
-               for key, value in whole.context.items()}
-    return replace(whole, start=part.end, time=mean(part.time, whole.time), samples=samples,
-                   mean=mean(part.mean, whole.mean), context=context, std=part.std,
-                   count=part.count / part.samples * samples)
 
 
 def title(calibration: Calibration) -> str:

@@ -23,7 +23,6 @@ import numpy as np
 from .poses import LONG_REST
 from ..effects import Context, Model, thermal_stream, ThermalStream
 from ..table import Floats
-from ..units import Units
 
 _SPAN = 5.0
 """Time over which rate and faults are counted [s]."""
@@ -161,10 +160,6 @@ class StreamStatistics:
         span = self._batches[-1].arrived - self._batches[0].arrived
         count = sum(batch.messages for batch in self._batches) - self._batches[0].messages
         return count / span if span > 0.0 else 0.0
-
-    def length_g(self, units: Units) -> float:
-        """Return |a| of the last messages [g]; NaN if not known."""
-        return math.nan if units.is_native else self.length / units.per_g
 
     @property
     def length(self) -> float:

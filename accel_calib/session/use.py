@@ -31,15 +31,15 @@ from ..calibration import Calibration, in_frame, on_topics, plan_session
 from ..effects import effects_of_file, OwnEffect, shown_name
 from ..errors import DamagedCalibrationError, InputError, StoredCalibrationError
 from ..findings import (
-    calibration_json, mounting_figures, outlook, rate as rating_of, Rating, rating_json,
-    refinement_json, rival_words, verdict_words)
-from ..geometry import angle_of, rotation_from_rpy, spread_directions
+    calibration_json, difference_words, mounting_figures, outlook, rate as rating_of, Rating,
+    rating_json, refinement_json, short_verdict, verdict_words)
+from ..geometry import rotation_from_rpy, spread_directions
 from ..pipeline import calibrated, is_partial, is_refined, Plan
 from ..refinement import refine as refine_poses, Refinement
 from ..stillness import Dwell
 from ..table import CONTEXT, is_quantity, Poses
 from ..text import counted, listed, now, plain
-from ..units import MG, Units, units_of
+from ..units import Units, units_of
 
 _DIRECTIONS = 100
 """Number of directions over which two calibrations are compared."""
@@ -88,7 +88,7 @@ def fit(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
     floor = quality.noise_floor_mg
     details = [*([] if floor is None else [f'noise floor {floor:.3f} mg']),
                *(f'pose {each.row} left out: {each.reason}' for each in calibration.rejected),
-               *calibration.warnings, change_words(before, calibration)]
+               *calibration.warnings, difference_words(before, calibration)]
     return Fitted(
         calibration, f'{rating.name}: {about}, residual {quality.rms_before_mg:.2f} mg before, '
         f'{quality.rms_after_mg:.3f} mg after', details, rating)
@@ -122,16 +122,9 @@ def refine(poses: Poses, units: Units, sensor: str, before: Calibration | None, 
         details.append(f'left out: {listed("pose", refinement.disturbed_poses)}')
     details += [*calibration.warnings, *refinement.advice]
     if not refinement.refusal:
-        details.append(change_words(before, calibration))
-    names = [shown_name(step.name) + (f' (or {", ".join(rival_words(step))})' if step.rivals
-                                      else '') for step in refinement.steps]
-    found, verb = ' and '.join(names), 's' if len(names) == 1 else ''
-    verdict = {'no_gap': 'no gap beyond the noise', 'explained': f'{found} explain{verb} the gap',
-               'described': f'{found} describe{verb} the gap', 'drifts': 'the offset drifts',
-               'unexplained': f'a gap remains beyond {found}' if names else
-               'a gap remains that no effect explains'}[refinement.verdict]
-    return Fitted(calibration, f'{rating.name}: {verdict}, {rating.figures}', details, rating,
-                  refinement)
+        details.append(difference_words(before, calibration))
+    return Fitted(calibration, f'{rating.name}: {short_verdict(refinement)}, {rating.figures}',
+                  details, rating, refinement)
 
 
 def rated(calibration: Calibration, refinement: Refinement | None, rating: Rating | None,
@@ -141,21 +134,6 @@ def rated(calibration: Calibration, refinement: Refinement | None, rating: Ratin
     whole = {**calibration_json(calibration, outlook(calibration, model)), **found}
     return (rating_of(calibration, refinement=refinement) if rating is None else rating,
             cast('dict[str, Any]', plain(whole)))
-
-
-def change_words(before: Calibration | None, after: Calibration) -> str:
-    """Return what changes with a new calibration, as one line; empty without an earlier one."""
-    if before is None:
-        return ''
-    offset = after.units.to_g(after.offset - before.offset) * MG
-    gain = 100.0 * (np.linalg.solve(before.gain, after.gain) - np.eye(3))
-    angle = angle_of(before.rotation.T @ after.rotation)
-    effects = set(before.model.effects) ^ set(after.model.effects)
-    words = [f'offset by ({", ".join(f"{part:+.2f}" for part in offset)}) mg',
-             f'gain by up to {np.max(np.abs(gain)):.3f} %', f'mounting by {angle:.2f}°']
-    words += [f'{"with" if name in after.model.effects else "without"} {name}'
-              for name in sorted(effects, key=str)]
-    return f'changes {", ".join(words)}'
 
 
 def differs(before: Calibration | None, after: Calibration) -> bool:

@@ -14,14 +14,14 @@ temperature changes.
 
 from .chunks import CaptureSettings, REPEATED, Repeated, settings_from
 from .detector import (
-    capture, Captured, check_axes, check_measured, is_one_direction, poses_from, samples_of,
-    select, StillDetector)
+    capture, Captured, check_axes, check_measured, dwells_of, is_one_direction, overlap,
+    poses_from, rest_after, samples_of, select, StillDetector, with_temperature)
 from .dwell import account_of, Dwell, Rest
 from .ramp import cells_of, is_turned_over, LEAST_RANGE, LEAST_RESTS, Ramp, ramp_of, rests_in_cells
 from .rule import rounding_left
 
-__all__ = ['LEAST_RANGE', 'LEAST_RESTS', 'REPEATED', 'Captured',
-           'CaptureSettings', 'Dwell', 'Ramp', 'Repeated', 'Rest', 'StillDetector', 'account_of',
-           'capture', 'cells_of', 'check_axes', 'check_measured', 'is_one_direction',
-           'is_turned_over', 'poses_from', 'ramp_of', 'rests_in_cells', 'rounding_left',
-           'samples_of', 'select', 'settings_from']
+__all__ = ['LEAST_RANGE', 'LEAST_RESTS', 'REPEATED', 'CaptureSettings', 'Captured', 'Dwell',
+           'Ramp', 'Repeated', 'Rest', 'StillDetector', 'account_of', 'capture', 'cells_of',
+           'check_axes', 'check_measured', 'dwells_of', 'is_one_direction', 'is_turned_over',
+           'overlap', 'poses_from', 'ramp_of', 'rest_after', 'rests_in_cells', 'rounding_left',
+           'samples_of', 'select', 'settings_from', 'with_temperature']

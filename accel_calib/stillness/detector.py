@@ -47,6 +47,9 @@ from ..table import ABOUT, CONTEXT, Floats, numbered, Poses, Recording
 from ..text import short
 from ..units import Units
 
+_SAME_TEMPERATURE = 120.0
+"""Rests within this time are assumed to have the same temperature [s]."""
+
 _BLOCK = 1 << 14     # samples summed at a time; they fit in the cache
 _AT_ONCE = 1 << 17   # samples passed to the detector at a time
 _BESIDE = 100        # earlier dwells together with which a new one is judged
@@ -366,6 +369,22 @@ def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSetti
     return Poses(columns, numbered(columns))
 
 
+def dwells_of(poses: Poses) -> list[Dwell]:
+    """Return the dwells of the rows of a pose table, each with an orientation of its own."""
+    dwells, unknown = [], np.full(3, np.nan)
+    for k in range(len(poses)):
+        row = {key: poses[key][k] for key in poses.columns}
+        time, count = float(row.get('time', 0.0)), float(row.get('count', 1.0))
+        dwells.append(Dwell(
+            start=time, end=time, time=time, mean=row['reading'],
+            std=row.get('std', np.zeros(3)), count=count, samples=max(1, round(count)),
+            context={key: row[key] for key in (*CONTEXT, 'rate', *poses.quantities)
+                     if key in row and np.all(np.isfinite(row[key]))},
+            orientation=-1 - k, doubtful=bool(row.get('doubtful', False)),
+            rate_std=row.get('rate_std', unknown), at_limit=bool(row.get('at_limit', False))))
+    return dwells
+
+
 def select(dwells: Sequence[Dwell], settings: CaptureSettings, units: Units) -> list[Dwell]:
     """Keep, merge or refuse repeated dwells, as set; doubtful dwells are kept."""
     if settings.repeated == 'keep':
@@ -405,6 +424,40 @@ def merged(first: Dwell, second: Dwell, units: Units) -> Dwell:
     return replace(first, end=second.end, mean=mean, std=noise * np.sqrt(count), count=count,
                    time=share * first.time + (1.0 - share) * second.time,
                    samples=samples, context=context, rate_std=rate_std)
+
+
+def rest_after(part: Dwell, whole: Dwell) -> Dwell:
+    """Return the remainder of a rest after a part of it, with the noise of the part."""
+    samples = whole.samples - part.samples
+    share = samples / whole.samples
+
+    def mean(before: Any, all_of_it: Any) -> Any:
+        return (all_of_it - (1.0 - share) * before) / share
+
+    context = {key: mean(part.context.get(key, value), value)
+               for key, value in whole.context.items()}
+    return replace(whole, start=part.end, time=mean(part.time, whole.time), samples=samples,
+                   mean=mean(part.mean, whole.mean), context=context, std=part.std,
+                   count=part.count / part.samples * samples)
+
+
+def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
+    """Return dwells with missing temperatures set to that of the nearest one; tables need all."""
+    known = [dwell for dwell in dwells if 'temperature' in dwell.context]
+    found, times = [], np.array([dwell.time for dwell in known])
+    for dwell in dwells:
+        away = np.abs(times - dwell.time)
+        is_near = np.min(away, initial=np.inf) <= _SAME_TEMPERATURE
+        if is_near and 'temperature' not in dwell.context:
+            warm = known[int(np.argmin(away))].context['temperature']
+            dwell = replace(dwell, context={**dwell.context, 'temperature': warm})
+        found.append(dwell)
+    return found
+
+
+def overlap(one: Dwell | Rest, other: Dwell) -> bool:
+    """Return whether two dwells overlap in time; they are then the same rest."""
+    return one.start <= other.end and other.start <= one.end
 
 
 _ONE_DIRECTION = math.cos(math.radians(6.0))

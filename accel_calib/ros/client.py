@@ -2,13 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A demonstration without hardware: simulator and calibrator in separate processes, over DDS.
+What runs beside a calibrator node: the reception of its progress, and a demonstration.
 
-This process acts as the user. It holds the simulated sensor in a pose until the calibrator has
-captured it, turns it to the next one, and calls ``~/fit`` and ``~/set_level``. Then it compares
-the messages with the truth of the simulator in other poses. If the sensor hides an effect, the fit
-lacks it, and so does the level; ``~/refine`` and another ``~/set_level`` follow, and the next
-poses show what remains.
+**Progress.** The node publishes ``~/progress`` up to four times per second while somebody listens,
+and at least once per second. A longer silence therefore means that the node or the network is
+down.
+
+**Demonstration.** It needs no hardware: simulator and calibrator run in separate processes, over
+DDS. This process acts as the user. It holds the simulated sensor in a pose until the calibrator
+has captured it, turns it to the next one, and calls ``~/fit`` and ``~/set_level``. Then it
+compares the messages with the truth of the simulator in other poses. If the sensor hides an
+effect, the fit lacks it, and so does the level; ``~/refine`` and another ``~/set_level`` follow,
+and the next poses show what remains.
 
 Every step waits for what the nodes report, and none for a time, so that the demonstration also
 succeeds on a slow machine.
@@ -16,7 +21,7 @@ succeeds on a slow machine.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import takewhile
@@ -27,12 +32,13 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
+from time import monotonic, sleep
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 import numpy as np
-import rclpy
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, Temperature
@@ -40,13 +46,128 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from .declare import LATCHED, SENSOR
-from .run import own_domain
+from .run import own_domain, started
 from ..effects import parse_effect
-from ..errors import AccelCalibError
+from ..errors import AccelCalibError, InputError
+from ..session import Progress
 from ..stored import read_calibration
 from ..table import Floats
 from ..text import counted
 from ..units import MG, rms, STANDARD_GRAVITY
+
+
+@contextmanager
+def _beside(make: Callable[[], Any], args: Sequence[str] = ()) -> Iterator[Any]:
+    """Yield a node of this process with an executor; `args` are those of ROS."""
+    with (started(list(args), 'check the arguments after --ros-args'),
+          SingleThreadedExecutor() as executor):
+        node = make()
+        executor.add_node(node)
+        yield node
+
+
+# ----------------------------------------------------------------------------- progress
+
+Show = Callable[[str, Progress | None, str], None]
+"""Function of the name of the node, its progress (None: no message yet), and a problem or ''."""
+
+_WAIT = 0.1
+"""Longest wait for a message before the end is checked [s]."""
+
+_FIRST = 6.0
+"""Longest wait for the first message [s]; DDS repeats a lost announcement after 3 s."""
+
+_SILENT = 3.0
+"""Longest wait for the next message [s]."""
+
+_NEXT = 1.5
+"""Wait for a second message [s]; the first one may have been published long ago."""
+
+_SUFFIX = '/progress'
+
+
+class _Receiver(Node):
+    """The progress of a calibrator: full name, such as ``/left/calibrator``, and messages."""
+
+    def __init__(self, name: str) -> None:
+        # A leading underscore hides the node from ros2 node list.
+        super().__init__('_accel_calib_watch', enable_rosout=False, start_parameter_services=False)
+        self.arrived = monotonic()  # of the last message, or the start
+        self.progress: Progress | None = None
+        self.received = 0
+        try:
+            found = self.create_subscription(
+                DiagnosticStatus, f'{name.rstrip("/")}{_SUFFIX}', self._on_message, LATCHED)
+        except InvalidTopicNameException as err:
+            raise InputError(f'--node is {name!r}, expected the name of a node',
+                             'set it to a name such as calibrator or left/calibrator') from err
+        self._topic = found.topic_name
+        self.calibrator = self._topic.removesuffix(_SUFFIX)
+
+    def _on_message(self, message: DiagnosticStatus) -> None:
+        self.progress = Progress.from_figures({each.key: each.value for each in message.values})
+        self.arrived = monotonic()
+        self.received += 1
+
+    def problem(self) -> tuple[str, ...]:
+        """Return what was found and expected, and what to do, if a message is overdue."""
+        if monotonic() - self.arrived <= (_SILENT if self.received else _FIRST):
+            return ()
+        topic = self._topic
+        others = [name.removesuffix(_SUFFIX) for name, kinds in self.get_topic_names_and_types()
+                  if name.endswith(_SUFFIX) and 'diagnostic_msgs/msg/DiagnosticStatus' in kinds
+                  and name != topic and self.count_publishers(name)]
+        expected = f'expected a message on {topic} every second'
+        if self.count_publishers(topic):
+            return (f'{self.calibrator} sends no message, {expected}',
+                    'check that the node still runs, and the network')
+        if others:
+            return (f'found {" and ".join(sorted(others))}, but not {self.calibrator}, {expected}',
+                    f'set --node {min(others).lstrip("/")}')
+        return (f'found no calibrator {self.calibrator}, {expected}',
+                'start it with accel-calib node, or check --node and ROS_DOMAIN_ID')
+
+
+def watch(name: str, show: Show, is_over: Callable[[], bool], args: Sequence[str] = ()) -> None:
+    """
+    Show the progress of a calibrator at each message, and problems, until it is over.
+
+    `name` is with or without namespace. `show` is called for each message, and each time the
+    problem changes; `is_over` about ten times per second. `args` are those of ROS, starting with
+    ``--ros-args``. InputError if ROS does not start, the name is not valid, or the node has
+    another version.
+
+    """
+    with _beside(partial(_Receiver, name), args) as receiver:
+        shown, problem = 0, ''
+        show(receiver.calibrator, None, problem)
+        while not is_over():
+            receiver.executor.spin_once(timeout_sec=_WAIT)
+            before, problem = problem, '; '.join(receiver.problem())
+            if receiver.received != shown or problem != before:
+                shown = receiver.received
+                show(receiver.calibrator, receiver.progress, problem)
+
+
+def current(name: str, is_over: Callable[[], bool], args: Sequence[str] = ()
+            ) -> tuple[str, Progress | None]:
+    """
+    Return the full name of a calibrator and its progress now; None: it was over before.
+
+    Parameters and errors are as in `watch`; InputError also if no node answers.
+
+    """
+    with _beside(partial(_Receiver, name), args) as receiver:
+        while receiver.received < 2 and not is_over():
+            receiver.executor.spin_once(timeout_sec=_WAIT)
+            if receiver.received and monotonic() - receiver.arrived > _NEXT:
+                break
+            if problem := receiver.problem():
+                raise InputError(*problem)
+        return receiver.calibrator, receiver.progress
+
+
+# ----------------------------------------------------------------------------- demonstration
 
 _POSES, _POSES_HIDDEN = 12, 16
 """Poses of the fit; more of them if the sensor hides an effect."""
@@ -136,11 +257,8 @@ class User(Node):
 
     def __init__(self, processes: Sequence[subprocess.Popen[bytes]],
                  report: Callable[[str], None]) -> None:
-        rclpy.init(args=[])
         super().__init__('demo')
         self._processes, self._report = processes, report
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self)
         self._temperature = float('nan')
         self._poses = np.zeros((0, 3))
         self._messages: dict[str, dict[int, tuple[float, float, float]]] = {
@@ -240,22 +358,16 @@ class User(Node):
 
     def _spin(self, until: Callable[[], bool], what: str) -> None:
         """Spin until a condition is true; the text names the condition in errors."""
-        ends = time.monotonic() + _PATIENCE
+        ends = monotonic() + _PATIENCE
         while not until():
             _check_running(self._processes)
-            if time.monotonic() > ends:
+            if monotonic() > ends:
                 raise AccelCalibError(f'{what}: not available within {_PATIENCE:.0f} s, '
                                       f'{counted(len(self._poses), "pose")} so far',
                                       'check whether a firewall blocks DDS on this machine')
-            look_again = time.monotonic() + _LOOK_EVERY
-            while time.monotonic() < look_again:
-                self._executor.spin_once(timeout_sec=_LOOK_EVERY)
-
-    def close(self) -> None:
-        """Leave DDS."""
-        self._executor.shutdown()
-        self.destroy_node()
-        rclpy.try_shutdown()
+            look_again = monotonic() + _LOOK_EVERY
+            while monotonic() < look_again:
+                self.executor.spin_once(timeout_sec=_LOOK_EVERY)
 
 
 def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
@@ -267,19 +379,19 @@ def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
     service refuses.
 
     """
-    began = time.monotonic()
+    began = monotonic()
     report('starting the calibrator node and a simulated Imu, turned by hand'
            + (f', that hides {hidden}' if hidden else ''))
     simulated = {**_HELD, 'effects': [*_EFFECTS, *([hidden] if hidden else [])]}
     with (_isolated() as folder, running('node', _NODE) as node,
           running('simulator', simulated) as simulator,
-          closing(User([node, simulator], report)) as demo):
+          _beside(partial(User, [node, simulator], report)) as demo):
         demo.capture(_POSES_HIDDEN if hidden else _POSES)
         report(f'~/fit: {demo.call("calibrator/fit")}')
         report(f'~/set_level: {demo.level()}')
         raw, corrected, truth = demo.measure(_CHECKED_HIDDEN if hidden else _CHECKED)
         outcome = Outcome(len(truth), before=_errors(raw, truth), after=_errors(corrected, truth),
-                          seconds=time.monotonic() - began)
+                          seconds=monotonic() - began)
         if not hidden:
             return outcome
         stored = folder / 'accel_calib' / 'demo.yaml'
@@ -291,7 +403,7 @@ def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
         _, corrected, truth = demo.measure(_CHECKED_HIDDEN)
         return replace(
             outcome, before=outcome.after, after=_errors(corrected, truth),
-            seconds=time.monotonic() - began, hidden=parse_effect(hidden)[0],
+            seconds=monotonic() - began, hidden=parse_effect(hidden)[0],
             found=tuple(str(name) for name in refined.effects if name not in fitted.effects),
             lag_s=0.0 if lag is None else lag.seconds)
 
@@ -316,7 +428,7 @@ def demonstrate_page(port: int, report: Callable[[str], None],
           running('simulator', _TIMED) as simulator):
         while not is_over():
             _check_running([node, simulator])
-            time.sleep(_LOOK_EVERY)
+            sleep(_LOOK_EVERY)
 
 
 @contextmanager
