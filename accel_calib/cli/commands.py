@@ -98,7 +98,8 @@ def next_command(step: NextStep, args: argparse.Namespace) -> str:
     match step.kind:
         case 'fit' | 'refine' if log:
             return command_line(step.kind, args, **files)
-        case 'level' if args.command in ('fit', 'calibrate', 'refine', 'thermal'):
+        # No command levels a calibration and keeps what it has from other poses.
+        case 'level' if base is None and args.command in ('fit', 'calibrate', 'refine', 'thermal'):
             name = 'calibrate' if args.command == 'refine' else args.command
             return command_line(name, args, **files, flat=next(iter(step.rows), 'ROW'))
         case 'verify' if written or base:

@@ -369,11 +369,9 @@ def beside_stored(poses_g: Poses, calibration: Calibration, model: Model) -> Pos
         ours['time'] = np.clip(ours['time'], *calibration.ranges['time'])
     elif 'time' in ours:
         theirs['time'] = np.full(count, np.nan)
-    if 'orientation' in ours:
-        theirs['orientation'] = np.min(ours['orientation']) - 1.0 - np.arange(count)
     columns = {key: np.concatenate([values, theirs[key]])
                for key, values in ours.items() if key in theirs}
-    joined = Poses(columns, _rows(poses_g, stored))
+    joined = Poses({**columns, **_orientations(poses_g, stored)}, _rows(poses_g, stored))
     return joined if joined.noise is not None else joined.without_columns('std', 'count')
 
 
@@ -382,7 +380,17 @@ def with_stored(poses: Poses, calibration: Calibration) -> Poses:
     stored = calibration.used_poses
     columns = {key: np.concatenate([poses[key], stored[key]]) for key in poses.columns
                if key in stored}
-    return replace(poses, columns=columns, row=_rows(poses, stored))
+    return replace(poses, columns={**columns, **_orientations(poses, stored)},
+                   row=_rows(poses, stored))
+
+
+def _orientations(poses: Poses, stored: Poses) -> dict[str, Floats]:
+    """Return the joined column ``orientation``, if one has it; stored poses share none of ours."""
+    if 'orientation' not in poses and 'orientation' not in stored:
+        return {}
+    ours, theirs = (each['orientation'] if 'orientation' in each else np.arange(float(len(each)))
+                    for each in (poses, stored))
+    return {'orientation': np.concatenate([ours, np.min(ours) - 1.0 - theirs + np.min(theirs)])}
 
 
 def _rows(poses: Poses, stored: Poses) -> NDArray[np.int64]:
