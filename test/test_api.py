@@ -281,3 +281,16 @@ def test_a_context_is_the_middle_of_the_ranges_at_rest_or_held_at_their_limits(
     np.testing.assert_array_equal(beyond['temperature'], [-20.0, 25.0, 90.0])
     known = refinement.calibration.held_context({'temperature': beyond['temperature']})
     np.testing.assert_array_equal(known['temperature'], held['temperature'])
+
+
+@pytest.mark.parametrize('wrong', [np.nan, np.inf])
+def test_a_reading_that_is_no_number_is_named_and_no_effect_is_blamed(
+        refinement: ac.Refinement, wrong: float) -> None:
+    with pytest.raises(InputError, match='not finite'):
+        refinement.calibration.apply([[0.1, wrong, 9.8], [0.0, 0.0, 9.8]], temperature=20.0)
+
+
+@pytest.mark.parametrize('flat', [None, 1])
+def test_a_frame_that_is_not_known_is_refused(poses: ac.Poses, flat: int | None) -> None:
+    with pytest.raises(ValueError, match="frame is 'enu'"):
+        ac.fit(poses, flat=flat, frame='enu')
