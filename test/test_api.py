@@ -294,3 +294,12 @@ def test_a_reading_that_is_no_number_is_named_and_no_effect_is_blamed(
 def test_a_frame_that_is_not_known_is_refused(poses: ac.Poses, flat: int | None) -> None:
     with pytest.raises(ValueError, match="frame is 'enu'"):
         ac.fit(poses, flat=flat, frame='enu')
+
+
+def test_a_lever_arm_acts_in_a_simulated_recording_while_the_sensor_turns() -> None:
+    arm = np.array([0.3, -0.2, 0.1])
+    none, turned = (ac.simulate({'lever_arm': size * arm}, recording=True, poses=6, dwell=0.5,
+                                noise=0.0) for size in (0.0, 1.0))
+    rate = none['rate']
+    np.testing.assert_allclose(turned.reading - none.reading,
+                               np.cross(rate, np.cross(rate, arm)), atol=0.1)
