@@ -281,3 +281,25 @@ def test_a_context_is_the_middle_of_the_ranges_at_rest_or_held_at_their_limits(
     np.testing.assert_array_equal(beyond['temperature'], [-20.0, 25.0, 90.0])
     known = refinement.calibration.held_context({'temperature': beyond['temperature']})
     np.testing.assert_array_equal(known['temperature'], held['temperature'])
+
+
+@pytest.mark.parametrize('wrong', [np.nan, np.inf])
+def test_a_reading_that_is_no_number_is_named_and_no_effect_is_blamed(
+        refinement: ac.Refinement, wrong: float) -> None:
+    with pytest.raises(InputError, match='not finite'):
+        refinement.calibration.apply([[0.1, wrong, 9.8], [0.0, 0.0, 9.8]], temperature=20.0)
+
+
+@pytest.mark.parametrize('flat', [None, 1])
+def test_a_frame_that_is_not_known_is_refused(poses: ac.Poses, flat: int | None) -> None:
+    with pytest.raises(ValueError, match="frame is 'enu'"):
+        ac.fit(poses, flat=flat, frame='enu')
+
+
+def test_a_lever_arm_acts_in_a_simulated_recording_while_the_sensor_turns() -> None:
+    arm = np.array([0.3, -0.2, 0.1])
+    none, turned = (ac.simulate({'lever_arm': size * arm}, recording=True, poses=6, dwell=0.5,
+                                noise=0.0) for size in (0.0, 1.0))
+    rate = none['rate']
+    np.testing.assert_allclose(turned.reading - none.reading,
+                               np.cross(rate, np.cross(rate, arm)), atol=0.1)

@@ -48,13 +48,15 @@ def bent(path, *, bend_mg):
     return path
 
 
-def test_a_bad_calibration_is_not_stored_unless_asked_for(tmp_path, capsys):
+@pytest.mark.parametrize('command', ['calibrate', 'fit', 'refine'])
+def test_a_bad_calibration_is_not_stored_unless_asked_for(command, tmp_path, capsys):
     path, out = bent(tmp_path / 'poses.csv', bend_mg=40.0), tmp_path / 'c.yaml'
-    status, result = calibrated(capsys, path, '-o', out, '--no-refine')
+    for more in ((), ('--keep-bad',)):
+        status, result = run_json(capsys, command, path, '-o', out, *more)
+        assert (status, result['rating'], out.exists()) == (1, 'BAD', bool(more))
+        assert out.with_suffix('.html').exists() is (command == 'calibrate')
+    status, result = run_json(capsys, 'verify', path, '-c', out)
     assert (status, result['rating']) == (1, 'BAD')
-    assert (out.exists(), out.with_suffix('.html').exists()) == (False, True)
-    assert calibrated(capsys, path, '-o', out, '--no-refine', '--keep-bad')[0] == 1
-    assert out.exists()
 
 
 def test_what_the_gate_refuses_is_never_stored(tmp_path, capsys):

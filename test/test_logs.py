@@ -208,3 +208,14 @@ def test_a_temperature_that_is_not_in_degrees_or_has_holes_is_left_out_by_name(
     poses = read_poses(write(tmp_path, text_of(rows, 'ax,ay,az,temperature,count')))
     assert ('temperature' in poses) is read
     assert [words in each.text for each in poses.findings] == [True] * (not read)
+
+
+@pytest.mark.parametrize(('order', 'words'), [
+    (lambda time, rng: np.zeros(len(time)), 'are equal'),
+    (lambda time, rng: rng.permutation(time), 'before that of the row above')])
+def test_times_that_are_no_clock_are_named_before_anything_is_captured(tmp_path, order, words):
+    made = samples(poses=3)
+    time = order(made['time'], np.random.default_rng(4))
+    path = write(tmp_path, text_of(rows_of(time, made['reading']), 'time,ax,ay,az'))
+    with pytest.raises(InputError, match=words):
+        read_log(path)

@@ -10,6 +10,7 @@ import re
 import accel_calib as ac
 from accel_calib.calibration import fit_poses, verify
 from accel_calib.effects import add_history
+from accel_calib.findings import rate
 from accel_calib.logs import read_recording, write_table
 from accel_calib.refinement import refine
 from accel_calib.stored import write_calibration
@@ -111,7 +112,7 @@ def test_six_faces_report_what_they_cannot_show(arguments, tmp_path, capsys):
     faces += np.random.default_rng(3).normal(size=(6, 3)) * 0.003
     np.savetxt(table, faces, '%.3f', ',', header='ax,ay,az', comments='')
     status, result = run_json(capsys, 'refine', table, '--report', page, *arguments)
-    assert status == 0
+    assert status == (result['rating'] == 'BAD') == bool(arguments)
     named = {name for step in result['steps'] for name in (step['effect'], *step['rivals'])}
     assert named <= {'offset', 'gain', 'axis_gain'}
     assert 'cross_axis' in [entry['effect'] for entry in result['not_testable']]
@@ -197,6 +198,21 @@ def test_hot_poses_beside_a_cold_calibration_name_the_temperature(stored):
     np.testing.assert_allclose([found.steps[0].parameters[axis] for axis in 'xyz'], WARM,
                                atol=5e-5)
     assert found.gap_mg > 5.0
+
+
+def test_what_one_warm_attitude_showed_is_kept_beside_new_poses_at_one_temperature():
+    rng = np.random.default_rng(25)
+    truth, cold = with_effects(rng, **TCO), np.full(20, 20.0)
+    up = np.vstack([random_directions(20, rng), np.repeat([[0.0, 0.0, 1.0]], 20, axis=0)])
+    old = poses_of(truth, rng, up, temperature=np.append(cold, np.linspace(20.0, 50.0, 20)),
+                   orientation=np.minimum(np.arange(40.0), 20.0))
+    base = refine(old, G, date='2026-11-02').calibration
+    for _ in range(2):  # what is stored keeps it, too
+        found = refine(poses_of(truth, rng, 20, temperature=cold), G, base=base)
+        base = found.calibration
+        assert (found.verdict, rate(base, refinement=found).name) == ('no_gap', 'GOOD')
+        assert rate(base, refinement=found).next.rows in ((), *((row,) for row in range(1, 21)))
+        np.testing.assert_allclose(base.model.values['offset_temperature'][:3], WARM, atol=5e-5)
 
 
 def test_a_stored_calibration_with_an_effect_of_time_is_compared_as_stored():

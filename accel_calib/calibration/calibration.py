@@ -388,7 +388,8 @@ class Calibration(Record):
         Raises
         ------
         InputError
-            If there are not three columns, context is missing, or the effects cannot be corrected.
+            If there are not three columns, a reading is not finite, context is missing, or the
+            effects cannot be corrected.
 
         """
         given = np.asarray(readings)
@@ -397,6 +398,9 @@ class Calibration(Record):
                              'pass the columns of the acceleration alone, and the context by '
                              'name, such as temperature=…')
         rows = np.atleast_2d(given.astype(float))
+        if not np.all(np.isfinite(rows)):
+            raise InputError('the readings hold numbers that are not finite, expected finite '
+                             'numbers', 'leave out these rows')
         context = {key: np.broadcast_to(np.asarray(values, float),
                                         (len(rows), 3) if key == 'rate' else (len(rows),))
                    for key, values in known.items()}

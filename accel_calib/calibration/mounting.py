@@ -55,7 +55,7 @@ from ..estimate import fit_12
 from ..finding import Finding, Level, without
 from ..geometry import angle_of, axes_of_signs, SIGNED_AXES
 from ..table import Floats, Poses
-from ..units import FrameName
+from ..units import FrameName, FRAMES
 
 _NOSE_DOWN = {'ros': np.array([-1.0, 0.0, 0.0]), 'ned': np.array([1.0, 0.0, 0.0]),
               'android': np.array([0.0, -1.0, 0.0]), 'win8': np.array([0.0, 1.0, 0.0])}
@@ -179,6 +179,8 @@ def level_by_rows(calibration: Calibration, poses: Poses, frame: FrameName, flat
     `flat`, or the nose is tilted down by less than 10°.
 
     """
+    if frame not in FRAMES:
+        raise ValueError(f'frame is {frame!r}, expected one of {FRAMES}')
     if flat is None:
         if nose_down is not None:
             raise InputError('there is a row with the nose down but no flat row, expected both',

@@ -98,7 +98,8 @@ def next_command(step: NextStep, args: argparse.Namespace) -> str:
     match step.kind:
         case 'fit' | 'refine' if log:
             return command_line(step.kind, args, **files)
-        case 'level' if args.command in ('fit', 'calibrate', 'refine', 'thermal'):
+        # No command levels a calibration and keeps what it has from other poses.
+        case 'level' if base is None and args.command in ('fit', 'calibrate', 'refine', 'thermal'):
             name = 'calibrate' if args.command == 'refine' else args.command
             return command_line(name, args, **files, flat=next(iter(step.rows), 'ROW'))
         case 'verify' if written or base:
@@ -206,7 +207,7 @@ COMMANDS = {
     'verify': Command(
         'evaluate a calibration on poses that it was not fitted to', 'compare',
         'other_log.csv -c calibration.yaml --max 5\n'
-        'exit status:\n  0: within --max, 1: above --max, 2: bad input', (
+        'exit status:\n  0: within --max, 1: above --max or BAD, 2: bad input', (
             *poses(), stored(required=True),
             option('--max', type=positive, metavar='MG', help='largest residual (RMS) of the '
                    'corrected poses [mg]; exit status 1 above it'),
@@ -223,7 +224,8 @@ COMMANDS = {
     'refine': Command(
         'find effects that a calibration lacks, and add them', 'fit',
         'poses.csv -o refined.yaml --report report.html', (
-            *poses(), *BASE, *outputs('refined calibration', 'report'), *shared('--verbose'),
+            *poses(), *BASE, *outputs('refined calibration', 'report'),
+            *shared('--keep-bad', '--verbose'),
             option('--plan', type=Path, metavar='FILE', help='poses to take next, which separate '
                    'the named effects from their rivals (CSV); not written if there is nothing to '
                    'separate; a folder for several POSES')),

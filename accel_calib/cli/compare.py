@@ -53,7 +53,8 @@ def run_verify(args: argparse.Namespace) -> Done:
               'rating_lines': [*rating.lines, *([f'      {command}'] if command else [])]}
     above = args.max is not None and not verification.rms_after_mg <= args.max
     result |= {} if args.max is None else {'max_mg': args.max, 'above_max': above}
-    return Done(result, several_verify([plain(result)]), status=FAILED if above else 0, page=page)
+    return Done(result, several_verify([plain(result)]),
+                status=FAILED if above or rating.name == 'BAD' else 0, page=page)
 
 
 def several_verify(results: Sequence[dict[str, Any]]) -> Iterator[Any]:

@@ -23,7 +23,7 @@ import numpy as np
 from rich.table import Table
 
 from .frame import (
-    check_target, console, Done, FAILED, given, intake, log_options, Output, progress, read_lines,
+    check_target, console, Done, given, intake, log_options, Output, progress, read_lines,
     rows_between, short_if_known, stored_calibration, table, Target, Verdict, working)
 from ..calibration import Calibration, NORM_MODELS
 from ..disk import STANDARD_OUTPUT, write_atomically
@@ -31,7 +31,8 @@ from ..effects import AXES, entry_of, parse_effect
 from ..errors import InputError
 from ..findings import (
     base_words, calibration_json, chance_words, effect_figures, linear_figures, outlook,
-    plan_lines, rate, refinement_json, request_words, rival_words, value_words, verdict_words)
+    plan_lines, rate, Rating, refinement_json, request_words, rival_words, value_words,
+    verdict_words)
 from ..logs import is_bag, open_log, write_blocks, write_table
 from ..pipeline import (
     calibrated, calibrated_log, captured_from, Correction, Intake, Outcome, Plan, ramp_or_poses,
@@ -141,12 +142,7 @@ def _store(args: argparse.Namespace, outcome: Outcome, result: dict[str, Any], *
     The rows left out are noted first; if they are several, their reasons come last.
 
     """
-    is_bad, stored, left_out = outcome.rating.name == 'BAD', list[Path](), list[str]()
-    if is_bad and args.output is not None and not args.keep_bad:
-        left_out = ['not stored, because it is BAD; to store it, use --keep-bad']
-    elif args.output is not None:
-        write_calibration(args.output, outcome.calibration)
-        stored = [args.output]
+    stored, left_out = _write(args, outcome.calibration, outcome.rating)
     rejected = outcome.calibration.rejected
     reasons = [f'left out: row {each.row}: {each.reason}' for each in rejected]
     if len(rejected) > 1:
@@ -154,8 +150,18 @@ def _store(args: argparse.Namespace, outcome: Outcome, result: dict[str, Any], *
         notes = [f'left out: {listed("row", rows)}', *notes, *reasons]
     else:
         notes = [*reasons, *notes]
-    return Done(result, [*shown, *left_out], outcome.rating, FAILED if is_bad else 0,
-                stored=stored, page=page, notes=notes)
+    return Done(result, [*shown, *left_out], outcome.rating, stored=stored, page=page, notes=notes)
+
+
+def _write(args: argparse.Namespace, calibration: Calibration, rating: Rating
+           ) -> tuple[list[Path], list[str]]:
+    """Write a calibration unless it is BAD; return the files written, and why there is none."""
+    if args.output is None:
+        return [], []
+    if rating.name == 'BAD' and not args.keep_bad:
+        return [], ['not stored, because it is BAD; to store it, use --keep-bad']
+    write_calibration(args.output, calibration)
+    return [args.output], []
 
 
 def _page(args: argparse.Namespace, log: Path, found: Intake, outcome: Outcome) -> str:
@@ -211,10 +217,8 @@ def run_refine(args: argparse.Namespace) -> Done:
     from ..report import calibration_page
 
     found, result = _refined(args)
-    rating, stored = rate(result.calibration, refinement=result), list[Path]()
-    if args.output is not None and not result.refusal:
-        write_calibration(args.output, result.calibration)
-        stored.append(args.output)
+    rating = rate(result.calibration, refinement=result)
+    stored, left_out = ([], []) if result.refusal else _write(args, result.calibration, rating)
     if args.plan is not None and result.plan.poses:
         from ..stored.exports import write_plan
 
@@ -235,10 +239,10 @@ def run_refine(args: argparse.Namespace) -> Done:
     rows, missing = result.disturbed_poses, [name for name, _ in result.not_testable]
     plan = [f'plan: {line}' for line in plan_lines(result.plan)] if args.plan is not None else []
     return Done({'file': args.poses, **refinement_json(result), 'read_as': found.read_as},
-                [*([table] if result.steps else ()), *plan], rating, stored=stored,
+                [*([table] if result.steps else ()), *plan, *left_out], rating,
+                stored=stored, refusal=result.refusal if args.output else (),
                 page=partial(calibration_page, result.calibration, rating, str(args.poses),
                              refinement=result),
-                refusal=result.refusal if args.output else (),
                 notes=[verdict_words(result),
                        *([f'left out: {listed("row", rows)}'] if rows else ()),
                        *(f'advice: {line}' for line in result.advice), *found.lines,

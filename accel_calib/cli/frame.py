@@ -183,7 +183,8 @@ def _carry_out(args: argparse.Namespace) -> Done:
     if done.rating is not None:
         step = done.rating.next
         judged = rating_json(done.rating, step, next_command(step, args))
-        done = replace(done, result={**done.result, **judged})
+        done = replace(done, result={**done.result, **judged},
+                       status=FAILED if done.rating.name == 'BAD' else done.status)
     return done
 
 

@@ -321,8 +321,9 @@ def simulate_recording(model: Model, directions: Floats, rng: np.random.Generato
         columns['temperature'] = np.linspace(temperatures[0], temperatures[-1], count)
     way = way_to((directions @ model.rotation.T)[np.newaxis], {})
     known = {'std': np.full((count, 3), noise_g), 'previous': way[place], **columns,
+             'rate': rate @ model.rotation.T,
              'since_turn': columns['time'] - columns['time'][np.searchsorted(place, place)]}
     reading = predict(model, force, add_turns(known))
     columns['reading'] = reading + rng.normal(size=(count, 3)) * noise_g
-    columns['rate'] = rate @ model.rotation.T + rng.normal(size=(count, 3)) * gyro_noise
+    columns['rate'] = known['rate'] + rng.normal(size=(count, 3)) * gyro_noise
     return Recording(columns, numbered(columns))

@@ -69,7 +69,7 @@ def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> R
            *_find_limits(expected), *_find_unchecked(expected), *named,
            *_find_inexact(expected, error, refinement)]
     noted = without(calibration.noted, *(each.kind for each in own))
-    return rated((*own, *noted), good, ', '.join(figures), step_after(calibration))
+    return rated((*own, *noted), good, ', '.join(figures), step_after(calibration, refinement))
 
 
 def _find_failures(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
@@ -247,9 +247,12 @@ def _remedy(expected: Expected, refinement: Refinement | None) -> dict[str, Any]
             'what is missing'}
 
 
-def step_after(calibration: Calibration) -> NextStep:
-    """Return what to do with a good calibration."""
+def step_after(calibration: Calibration, refinement: Refinement | None = None) -> NextStep:
+    """Return what to do with a good calibration; the rows are not those of its stored base."""
     poses, words = calibration.used_poses, 'place the robot level, and level the mounting by it'
+    if refinement is not None and 'new' in refinement.poses_g:
+        old = refinement.poses_g['new'] <= 0.0
+        poses = poses.take(~np.isin(poses.row, refinement.poses_g.row[old]))
     if calibration.is_levelled:
         low, high = range_of(poses, 'temperature')
         room = max(SPAN.value - (high - low), 0.0) / 2.0

@@ -35,6 +35,7 @@ from .flight import DATAFLASH, read_dataflash, read_ulg
 from .names import meaning, record_instead
 from .quantities import are_samples, decide_quantities
 from .text import PEEKED, text_table, TextTable
+from .times import check_order
 from ..disk import check_regular, FIRST_LINE
 from ..errors import DamagedLogError, InputError, needing, saying
 from ..finding import Finding
@@ -250,6 +251,7 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
         head = next(blocks)
         check_units(head, quantities.units, str(path))
         if 'time' in head and are_samples(head.columns):
+            check_order(head['time'], str(path))
             samples = (Recording(**vars(block)) for block in chain((head,), blocks))
             count = len(head)
             if text.more:  # the size of the file, and the rows of this block, tell about how many

@@ -71,6 +71,9 @@ _REVERSED = 0.9
 _COARSE_S, _COARSE_ROWS = 0.05, 3.0
 """Smallest step of stamps [s], and smallest number of samples with one stamp, that are spread."""
 
+_UNSORTED, _MANY_STEPS = 0.2, 50
+"""Share of steps back in time above which rows are in no order, of at least so many steps."""
+
 _MANY_ROWS = 500
 _WINDOW = 8
 _AT_REST = 0.3
@@ -161,6 +164,20 @@ def clock_of(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
             rows = float(ends[-1] - ends[0]) / (len(ends) - 1)
             clock.interval, clock.period = interval, interval / rows
     return clock
+
+
+def check_order(time: Floats, source: str) -> None:
+    """Raise InputError if the times of many samples are equal, or in no order."""
+    steps = np.diff(time)
+    back = int(np.count_nonzero(steps < 0.0))
+    if len(steps) >= _MANY_STEPS and not np.any(steps):
+        raise InputError(f'{source}: the times of {len(time)} rows are equal, expected times that '
+                         'advance', 'leave them out, and state the samples per second: '
+                         '--columns time= --rate HZ')
+    if len(steps) >= _MANY_STEPS and back > _UNSORTED * len(steps):
+        raise InputError(f'{source}: the times of {back} of {len(steps)} rows are before that of '
+                         'the row above, expected rows in the order of their times',
+                         'sort the rows by their times')
 
 
 def _stated_clock(columns: Chosen, first: Cells, options: LogOptions) -> Clock:

@@ -26,7 +26,7 @@ from importlib import import_module
 
 import numpy as np
 
-from .search import beside_stored, Found, join_rows, sampled, search, with_changes
+from .search import beside_stored, Found, join, sampled, search, with_changes
 from .state import fitted_state, is_noise, State
 from .steps import (
     find_rivals, not_testable, Remark, remarks_on, Stage, Step, steps_of, untestable, Verdict,
@@ -493,10 +493,7 @@ def refined_calibration(base: Calibration, final: State, added: tuple[EffectKey,
     kept, poses = final.poses_g, given.poses
     if 'new' in kept:  # beside the poses of the stored calibration
         if final.model.effects == model.effects and all(key in base.poses for key in model.needs):
-            stored = base.used_poses
-            poses = replace(poses, row=join_rows(poses, stored), columns={
-                key: np.concatenate([values, stored[key]])
-                for key, values in poses.columns.items() if key in stored})
+            poses = join(poses, base.used_poses)
         else:
             kept = kept.take(kept['new'] > 0.0)
     at_poses = judge(model, kept if base.form.known_orientation

@@ -164,17 +164,21 @@ def beside_stored(poses_g: Poses, calibration: Calibration, model: Model) -> Pos
         ours['time'] = np.clip(ours['time'], *calibration.ranges['time'])
     elif 'time' in ours:
         theirs['time'] = np.full(count, np.nan)
-    if 'orientation' in ours:
-        theirs['orientation'] = np.min(ours['orientation']) - 1.0 - np.arange(count)
-    columns = {key: np.concatenate([values, theirs[key]])
-               for key, values in ours.items() if key in theirs}
-    joined = Poses(columns, join_rows(poses_g, stored))
+    joined = join(replace(poses_g, columns=ours), replace(stored, columns=theirs))
     return joined if joined.noise is not None else joined.without_columns('std', 'count')
 
 
-def join_rows(poses: Poses, stored: Poses) -> NDArray[np.int64]:
-    """Return the row numbers of poses, followed by new ones for those of a stored calibration."""
-    return np.concatenate([poses.row, int(poses.row.max()) + 1 + np.arange(len(stored))])
+def join(poses: Poses, stored: Poses) -> Poses:
+    """Return poses followed by those of a stored calibration, in orientations of their own."""
+    columns = {key: np.concatenate([values, stored[key]])
+               for key, values in poses.columns.items() if key in stored}
+    if 'orientation' in poses or 'orientation' in stored:
+        ours, theirs = (each['orientation'] if 'orientation' in each else
+                        np.arange(float(len(each))) for each in (poses, stored))
+        columns['orientation'] = np.concatenate([
+            ours, np.min(ours) - 1.0 - theirs + np.min(theirs)])
+    rows = int(poses.row.max()) + 1 + np.arange(len(stored))
+    return replace(poses, columns=columns, row=np.concatenate([poses.row, rows]))
 
 
 @dataclass(frozen=True)
