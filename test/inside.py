@@ -90,7 +90,7 @@ from accel_calib.session.conditions import step_of
 from accel_calib.session.live_capture import LiveCapture, with_temperature
 from accel_calib.session.pose_guide import Guide
 from accel_calib.session.sensor import new_sensor, rest_after
-from accel_calib.session.settings import capture_settings, changed, default_of
+from accel_calib.session.settings import changed, default_of
 from accel_calib.session.state import figures
 from accel_calib.session.store import (
     aside, MOST_STEPS, SensorFiles, Store as SensorStore, store_of)
