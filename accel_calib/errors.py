@@ -2,10 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Errors that a user can fix, and the last resort for those that nobody expected.
+Errors that a user can fix, the last resort for others, and what a program sets when it starts.
 
 An error has a `message` (one line: what was found, what was expected) and an `advice` (one line:
 what to do). If it is about a log, `read_as` says how the log was read.
+
+**One thread** for each matrix operation of commands and nodes: arrays here are small, and threads
+that share one wait for each other in busy loops. Beside two other processes on two processors, a
+refinement with the OpenBLAS of numpy 1.26 took 10 times as long with two threads as with one.
 
 """
 
@@ -113,6 +117,16 @@ TAKE_ALL_SIDES = 'take poses with each side of the sensor up and down, and some 
 NEEDS_ROS = ("source /opt/ros/jazzy/setup.bash, or run pip install '.[ros]' in the folder of the "
              'sources')
 """Advice if ROS 2 is not installed."""
+
+
+ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
+"""Environment variables that libraries for matrices read when numpy is imported."""
+
+
+def use_one_thread() -> None:
+    """Set the variables that are not set yet. Call it before numpy is imported."""
+    for name, count in ONE_THREAD.items():
+        os.environ.setdefault(name, count)
 
 
 def hide_warnings() -> None:

@@ -17,8 +17,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .statistics import rms
 from .table import Floats
+from .units import rms
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:

@@ -25,8 +25,9 @@ import numpy as np
 from .calibration import (
     Calibration, check_sensor, Curve, curve_of, determines, directions_of, fit_partial, fit_poses,
     fit_with_fleet, flat_direction, FleetPrior, level, level_by_rows, lies_in_cone, lies_in_plane,
-    NORM_MODELS, PRIOR, SampleContext, thermal_alone, with_curve, without_curve)
-from .effects import Context, LADDER, Model, OwnEffect, PROCESSES
+    NORM_MODELS, Outside, outside, PRIOR, thermal_alone, with_curve, without_curve)
+from .effects import (
+    Context, context_of_samples, entry_of, LADDER, Model, OwnEffect, PROCESSES, thermal_stream)
 from .errors import InputError, RefusedFitError, saying
 from .finding import explained_by, Finding
 from .findings import outside_words, rate, Rating, USES_LIMIT
@@ -170,8 +171,7 @@ def _captured(source: Source, log: OpenLog, options: LogOptions, settings: Mappi
     advice = f'{more} with still_std_max {limit:.3g}'
     if not count:
         name = 'the recording' if isinstance(source, Recording) else str(source)
-        raise _nothing_still(name, found, log.units, asked, findings,
-                             finds=advice if more else '')
+        raise _nothing_still(name, found, log.units, asked, findings, finds=advice if more else '')
     lines = [f'captured {counted(count, "pose")} from {counted(found.recorded, "sample")} in '
              f'{found.seconds:.0f} s']
     if more >= 2 * count:
@@ -190,8 +190,7 @@ def _nothing_still(source: str, found: Captured, units: Units, asked: CaptureSet
         return InputError(f'{what}: {"; ".join(each.text for each in findings)}; expected at '
                           'least one', f'{findings[-1].advice}; {tried}')
     if math.isfinite(found.quietest):
-        limit = (f', the limit is {found.threshold:.2g}' if math.isfinite(found.threshold)
-                 else '')
+        limit = f', the limit is {found.threshold:.2g}' if math.isfinite(found.threshold) else ''
         what += (f': in its quietest {asked.still_window:g} s the standard deviation is '
                  f'{found.quietest:.2g} {units.name}{limit} for at least {asked.min_dwell:g} s')
     return InputError(f'{what}; expected at least one',
@@ -536,11 +535,25 @@ class Correction:
     def __init__(self, calibration: Calibration, units: Units | UnitName, sensor: str) -> None:
         check_sensor(calibration, sensor)
         self.calibration = calibration.in_units(units)
-        self._context = SampleContext(self.calibration)
+        self._thermal = thermal_stream(self.calibration.model)
+        self._compared: dict[str, Outside] = {}
+        self._lacking = ''
 
     def context(self, samples: Table) -> Context:
         """Return the context of the next block, as the effects need it."""
-        return self._context.of(samples.columns, len(samples))
+        model = self.calibration.model
+        found = context_of_samples(samples.columns, len(samples), model, self._thermal)
+        self._lacking = ''
+        if lacking := [key for key in model.neutral if key not in samples]:
+            names = [str(each) for each in model.effects if {*entry_of(each).needs} & {*lacking}]
+            self._lacking = (f'the samples have no {" and ".join(lacking)}: {" and ".join(names)} '
+                             f'{"is" if len(names) == 1 else "are"} not corrected')
+        for key, block in outside(self.calibration, found).items():
+            before = self._compared.get(key, block)
+            self._compared[key] = block if before is block else replace(
+                block, count=before.count + block.count, samples=before.samples + block.samples,
+                least=min(before.least, block.least), most=max(before.most, block.most))
+        return found
 
     def __call__(self, samples: _Samples) -> _Samples:
         """Return the next block with corrected readings, in m/s² or g, in the levelled frame."""
@@ -556,6 +569,7 @@ class Correction:
     @property
     def notes(self) -> list[str]:
         """Return what the samples lack, and what left the range of the calibration, so far."""
-        return [*filter(None, [self._context.lacking]), *(
+        return [*filter(None, [self._lacking]), *(
             f'{each.count} of {counted(each.samples, "sample")} are outside of the range of the '
-            f'calibration: {outside_words(each)}; {USES_LIMIT}' for each in self._context.left)]
+            f'calibration: {outside_words(each)}; {USES_LIMIT}'
+            for each in self._compared.values() if each.count)]

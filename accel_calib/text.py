@@ -74,8 +74,7 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]], kind: str = '',
     lines = ''.join(opening + ''.join(f'<td>{escape(value)}</td>' for value in row) + '</tr>\n'
                     for opening, row in zip(openings, rows))
     opening = f'<table class="{kind}">' if kind else '<table>'
-    return (f'{opening}\n<thead><tr>{cells}</tr></thead>\n'
-            f'<tbody>\n{lines}</tbody>\n</table>\n')
+    return f'{opening}\n<thead><tr>{cells}</tr></thead>\n<tbody>\n{lines}</tbody>\n</table>\n'
 
 
 def counted(count: int, noun: str) -> str:

@@ -43,7 +43,7 @@ MODULES = {
 
 sys.path[:0] = [str(ROOT), str(ROOT / 'test'), str(ROOT / 'benchmarks')]
 
-from accel_calib.one_thread import use_one_thread  # noqa: E402
+from accel_calib.errors import use_one_thread  # noqa: E402
 
 use_one_thread()
 

@@ -10,8 +10,8 @@ from typing import Any
 
 from accel_calib.errors import AccelCalibError
 from accel_calib.session import (
-    answered, CalibratorSettings, columns_of, diagnostics, Log, next_step, Result, run, Session,
-    ShowPoses, state, Task)
+    answered, CalibratorSettings, columns_of, diagnostics, Log, next_step, progress, Result, run,
+    Session, ShowPoses, Task)
 import numpy as np
 import pytest
 
@@ -157,7 +157,7 @@ class Person:
             if self.driver.now > end:
                 break
             present = self.driver.session.state
-            now, action = state.progress(present), next_step(present)
+            now, action = progress(present), next_step(present)
             assert (now.step, now.advice, now.command) == (
                 action.kind, action.text, action.command)
             self.steps.append(action.kind)

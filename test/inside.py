@@ -25,10 +25,10 @@ from accel_calib.calibration.mounting import (
 from accel_calib.calibration.partial import common_sensors, without_knocked
 from accel_calib.calibration.planning import choose_levels, find_undetermined, missing_poses
 from accel_calib.cli.commands import COMMANDS, HIDDEN as DEMO_CHOICES, parser
+from accel_calib.cli.frame import Output, shown
 from accel_calib.cli.main import main
 from accel_calib.cli.nodes import changes, screen, state
 from accel_calib.cli.options import in_one_line
-from accel_calib.cli.output import Output, shown
 from accel_calib.comparison import rotation_free
 from accel_calib.comparison.agreement import (
     on_one_scale, outlier, p_values, Repeatability, repeatability_of, Runs)
@@ -44,9 +44,8 @@ from accel_calib.estimate.equations import equations, measured
 from accel_calib.estimate.outliers import _look_alikes as look_alikes
 from accel_calib.findings import mounting_figures
 from accel_calib.fleet.overview import (
-    digest, digest_of, estimated, Months, not_agreeing, odd_sensors, overview, priors_of,
-    shared_effects, typical_of, Values as SensorValues)
-from accel_calib.fleet.page import write_fleet_page
+    digest, digest_of, estimated, not_agreeing, odd_sensors, OfModel, overview, priors_of,
+    shared_effects, typical_of, Values as SensorValues, write_fleet_page)
 from accel_calib.fleet.recording import (
     as_folder, content_hash, date_of, on_disk, schema, sensor_of)
 from accel_calib.fleet.run import mapped
@@ -54,30 +53,28 @@ from accel_calib.fleet.sensors import alike, drift_of, merge_sensor, write_parqu
 from accel_calib.geometry import (
     attitude_words, distinct, OVER_THE_SPHERE, quaternion_of, rotation_from_rpy, spread_directions,
     unit, words_of)
-from accel_calib.live import sources
-from accel_calib.live.sources import _interval as interval_of_lines, is_port, open_source, Source
 from accel_calib.logs import bag_samples, child, layout_with, LogOptions, open_bag, open_log, text
-from accel_calib.logs.flight import read_dataflash, read_ulg
+from accel_calib.logs.bag import frame_ids, stamps_of
 from accel_calib.logs.names import meaning
 from accel_calib.logs.quantities import are_samples
-from accel_calib.logs.serialized import frame_ids, stamps_of
-from accel_calib.messages.one_reading import OneReading
-from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS, fit_components
-from accel_calib.noise.curve import allan_variances, longest_rest, octaves, shares, spread_of
+from accel_calib.noise.allan import (
+    allan_variances, COMPONENTS as ALLAN_COMPONENTS, fit_components, octaves, shares, spread_of)
+from accel_calib.noise.figures import longest_rest
 from accel_calib.pipeline import (
     calibrated as calibrated_by, Correction, Intake, is_partial, Plan as FitPlan, poses_of,
     RampIntake, thermally_calibrated)
-from accel_calib.refinement import base as refine_base
-from accel_calib.refinement.base import clipped, grid_step, off_grid, sampled, unclipped
-from accel_calib.refinement.beam import accepted, explored, reshaped
+from accel_calib.refinement import search as refine_search
 from accel_calib.refinement.curves import (
-    _grown as grown_curve, _rss_beside as rss_beside, best_curve, FoundCurve, Near, probabilities,
-    Process, process_of, SIGNIFICANT, Walk, walk_beside)
+    _grown as grown_curve, _rss_beside as rss_beside, best_curve, FoundCurve, Process, process_of,
+    SIGNIFICANT, Walk, walk_beside)
 from accel_calib.refinement.linear import (
-    _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, Set, with_outliers)
+    _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, Set, with_outliers)
 from accel_calib.refinement.search import (
-    _is_better as is_better_than_walk, _less as less, search as search_effects)
-from accel_calib.refinement.state import beginning, candidates, fitted_state, linearised, WORTH
+    _is_better as is_better_than_walk, _less as less, sampled, search as search_effects)
+from accel_calib.refinement.settle import accepted, explored, Near, probabilities, reshaped
+from accel_calib.refinement.state import (
+    beginning, candidates, clipped, fitted_state, grid_step, linearised, off_grid, outside_of,
+    unclipped, WORTH)
 from accel_calib.refinement.steps import remarks_on
 from accel_calib.report.page import all_drawings, axis_figures, curve_parts
 from accel_calib.report.residuals import residuals_of
@@ -86,12 +83,10 @@ from accel_calib.report.stability import comparison_page
 from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store, worker
 from accel_calib.session.commands import poses_changed
-from accel_calib.session.conditions import step_of
-from accel_calib.session.live_capture import LiveCapture, with_temperature
-from accel_calib.session.pose_guide import Guide
-from accel_calib.session.sensor import new_sensor, rest_after
+from accel_calib.session.conditions import figures, step_of
+from accel_calib.session.poses import Guide, LiveCapture, with_temperature
 from accel_calib.session.settings import changed, default_of
-from accel_calib.session.state import figures
+from accel_calib.session.state import new_sensor, rest_after
 from accel_calib.session.store import (
     aside, MOST_STEPS, SensorFiles, Store as SensorStore, store_of)
 from accel_calib.session.stream import StreamStatistics, TemperatureHistory
@@ -160,7 +155,7 @@ def server_of_children() -> int:
     return process.pid if process else 0
 
 
-PAGE_FOLDER = Path(sources.__file__).parent / 'page'
+PAGE_FOLDER = Path(session_store.__file__).parents[1] / 'live' / 'page'
 """Files of the live page."""
 
 # Limits that a test lowers, because the real ones take too long: arguments of monkeypatch.setattr.
@@ -170,24 +165,25 @@ BLOCK_OF_A_BAG = bag_samples, 'BLOCK'
 MOST_VALUES_READ = plain_yaml, 'MOST_VALUES'
 MOST_BYTES_READ = plain_yaml, 'MOST_BYTES'
 MOST_LETTERS_OF_LABELS = calibration_yaml, '_MOST_LETTERS'
-PATIENCE_OF_A_PORT = sources, '_PATIENCE_S'
-HEAD_OF_A_PORT = sources, '_HEAD_S'
-MOST_OF_A_HEAD = sources, '_HEAD_CHARACTERS'
-CLOCK_OF_A_SOURCE = sources, 'time'
 PATIENCE_OF_A_WORKER = worker, '_PATIENCE'
-LARGEST_SAMPLE = refine_base, 'MOST'
+LARGEST_SAMPLE = refine_search, 'MOST'
 LARGEST_NUMBER_OF_STEPS = session_store, 'MOST_STEPS'
 PATIENCE_WITH_A_CHILD = child, '_PATIENCE_S'
 
 if find_spec('aiohttp'):  # what the live page needs is not installed everywhere
-    from accel_calib.live import server, viewer
-    from accel_calib.live.host import Host
-    from accel_calib.live.server import PageServer
-    from accel_calib.live.viewer import (
+    from accel_calib.live import exchange, host, server
+    from accel_calib.live.exchange import (
         announce, BUTTONS, LARGEST as LARGEST_LIVE_MESSAGE, PERIOD as LIVE_PERIOD, qr_code,
         reachable)
+    from accel_calib.live.host import (
+        _interval as interval_of_lines, Host, is_port, open_source, Source)
+    from accel_calib.live.server import PageServer
 
-    PATIENCE_FOR_A_HELLO = viewer, '_HELLO_S'
+    CLOCK_OF_A_SOURCE = host, 'time'
+    HEAD_OF_A_PORT = host, '_HEAD_S'
+    MOST_OF_A_HEAD = host, '_HEAD_CHARACTERS'
+    PATIENCE_OF_A_PORT = host, '_PATIENCE_S'
+    PATIENCE_FOR_A_HELLO = exchange, '_HELLO_S'
     PATIENCE_FOR_A_REQUEST = server, '_REQUEST_S'
     PERIOD_OF_A_COMPLAINT = server, '_QUIET_S'
     STUCK = server, 'STUCK_S'

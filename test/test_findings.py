@@ -181,7 +181,7 @@ def test_what_a_robot_cannot_determine_is_stated_once(fitted):
 def test_poses_of_another_sensor_are_bad_and_noisy_ones_do_not_verify(effects, noise, expected):
     calibration = ac.fit(simulated(poses=24))
     new = simulated(effects, poses=12, noise=noise, seed=9)
-    assert rate_verification(ac.verify(new, calibration), calibration).name == expected
+    assert rate_verification(ac.verify(new, calibration), calibration, new).name == expected
 
 
 def test_a_verification_never_advises_to_replace_what_it_verified(tmp_path):

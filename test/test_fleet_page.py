@@ -28,8 +28,8 @@ from accel_calib.stored import read_calibration, read_prior, write_calibration, 
 from accel_calib.table import Floats, Poses
 from fleet_case import page_of
 from inside import (
-    as_folder, digest, digest_of, drift_of, estimated, merge_sensor, Model, MODELS, Months,
-    not_agreeing, odd_sensors, overview, priors_of, schema, SensorValues, shared_effects,
+    as_folder, digest, digest_of, drift_of, estimated, merge_sensor, Model, MODELS, not_agreeing,
+    odd_sensors, OfModel, overview, priors_of, schema, SensorValues, shared_effects,
     simulate_poses, spread_directions, typical_of, unit, with_vector, write_fleet_page,
     write_parquet)
 import numpy as np
@@ -103,7 +103,7 @@ def test_a_value_that_is_known_badly_is_not_odd() -> None:
 
 def test_months_have_the_quantiles_of_all_calibrations() -> None:
     rng = np.random.default_rng(4)
-    months = Months(rng)
+    months = OfModel(rng)
     for _ in range(3000):
         months.add('2026-03', rng.normal(size=9))
     months.add('2026-04', np.zeros(9))  # too few to state quantiles

@@ -13,7 +13,7 @@ from accel_calib.logs import LogOptions
 from accel_calib.stillness import capture
 from accel_calib.table import Recording
 from data.logs import make
-from inside import read_dataflash, read_log, read_ulg
+from inside import Log, read_log
 import numpy as np
 import pytest
 from shared import LOGS
@@ -22,16 +22,16 @@ from test_logs import write
 WITHIN_SD = 5.0
 
 
-def px4(path: Path) -> Any:
+def px4(path: Path) -> Log:
     """Read a log of PX4."""
     pytest.importorskip('pyulog')
-    return read_ulg(path)
+    return read_log(path)
 
 
-def ardupilot(name: str | Path) -> Any:
+def ardupilot(name: str | Path) -> Log:
     """Read a sample of ArduPilot, or another path."""
     pytest.importorskip('pymavlink')
-    return read_dataflash(LOGS / 'ardupilot' / name)
+    return read_log(LOGS / 'ardupilot' / name)
 
 
 def check(recording: Recording, units: Any, name: str) -> Calibration:
@@ -91,16 +91,16 @@ def test_samples_that_px4_marks_as_invalid_are_left_out_and_counted(tmp_path: Pa
     kind, relative = fields['accelerometer_timestamp_relative']
     fields['accelerometer_timestamp_relative'] = (kind, [0x7fffffff] * 3 + list(relative[3:]))
     log = px4(write(tmp_path, make.ulog_bytes([('sensor_combined', 0, fields)])))
-    assert len(log.recording['time']) == len(relative) - 3
+    assert len(log.table['time']) == len(relative) - 3
     assert '3 rows of' in log.notes[0]
 
 
 def test_flight_logs_that_are_cut_off_are_read_up_to_there(tmp_path: Path) -> None:
     data = (LOGS / 'px4/thermal.ulg').read_bytes()[:40_001]
-    assert 300 < len(px4(write(tmp_path, data)).recording['time']) < 600
+    assert 300 < len(px4(write(tmp_path, data)).table['time']) < 600
     data = (LOGS / 'ardupilot/two_imus.bin').read_bytes()[:50_003]
     log = ardupilot(write(tmp_path, data))
-    assert 400 < len(log.recording['time']) < 600
+    assert 400 < len(log.table['time']) < 600
     assert any('1 message cut' in note for note in log.notes)
 
 
@@ -112,8 +112,8 @@ def test_garbage_within_an_ardupilot_log_is_passed_over_and_noted(tmp_path: Path
     path = write(tmp_path, whole[:start] + b'\x00\x17\xff' * 9 + whole[start:])
     log = ardupilot(path)
     assert ' left out' in ' '.join(log.notes)
-    np.testing.assert_array_equal(log.recording.reading[:, 2],
-                                  ardupilot('raw_acc.bin').recording.reading[:, 2])
+    np.testing.assert_array_equal(log.table.reading[:, 2],
+                                  ardupilot('raw_acc.bin').table.reading[:, 2])
 
 
 def test_the_calibration_that_an_ardupilot_log_holds_already_is_named(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import zipfile
 
 from accel_calib.errors import InputError
 from accel_calib.fleet import recordings
-from accel_calib.logs import FORMATS, LogOptions, open_log, SUFFIXES
+from accel_calib.logs import FORMATS, LogOptions, open_log, read_poses, SUFFIXES
 from accel_calib.table import Recording
 from inside import model_with, read_log, simulate_recording, spread_directions
 import numpy as np
@@ -193,3 +193,18 @@ def test_logs_of_others_become_poses(name: str, poses: int, tmp_path: Path,
     path = data(f'logs/{name}')
     _, made = run_json(capsys, 'capture', path, '-o', tmp_path / 'poses.csv')
     assert made['poses'] == poses
+
+
+@pytest.mark.parametrize(('scale', 'zero', 'empty', 'read', 'words'), [
+    (1.0, 0.0, 0, True, ''), (1.0, 273.15, 0, False, 'about 29'), (1000.0, 0.0, 0, False, 'about'),
+    (340.0, -36.53, 0, False, 'about -'), (1.0, 0.0, 3, False, '3 of 24 cells')])
+def test_a_temperature_that_is_not_in_degrees_or_has_holes_is_left_out_by_name(
+        tmp_path, scale, zero, empty, read, words):
+    rng = np.random.default_rng(5)
+    temperature = scale * (rng.uniform(15.0, 35.0, 24) + zero)
+    rows = rows_of(G * spread_directions(24), temperature, np.full(24, 100))
+    for row in rng.permutation(24)[:empty]:
+        rows[row][3] = ''
+    poses = read_poses(write(tmp_path, text_of(rows, 'ax,ay,az,temperature,count')))
+    assert ('temperature' in poses) is read
+    assert [words in each.text for each in poses.findings] == [True] * (not read)

@@ -21,10 +21,10 @@ from accel_calib.logs import (
     ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
     doubles_at, IMU_DOUBLES, joined, layout_of, LITTLE_ENDIAN, ORIENTATION, ORIENTATION_COVARIANCE,
     renamed, samples_of)
-from accel_calib.messages import corrected, output_frame, Rewriter
+from accel_calib.messages import corrected, OneReading, output_frame, Rewriter
 from accel_calib.units import STANDARD_GRAVITY
 from bag_files import swapped
-from inside import frame_ids, Model, OneReading, rotation_from_rpy, stamps_of
+from inside import frame_ids, Model, rotation_from_rpy, stamps_of
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -7,14 +7,15 @@ from dataclasses import replace
 import re
 import tracemalloc
 
-from accel_calib.calibration import outside, SampleContext
+from accel_calib.calibration import outside
 from accel_calib.effects import context_of_samples
 from accel_calib.findings import outside_words
 from accel_calib.logs import read_recording, write_blocks, write_table
 from accel_calib.stored import write_calibration
 from bag_files import write_bag
 from driven import Driver
-from inside import model_with, ROWS_OF_A_TEXT, simulate_recording, spread_directions
+from inside import (
+    Correction, model_with, Poses, ROWS_OF_A_TEXT, simulate_recording, spread_directions)
 import numpy as np
 import pytest
 from shared import known, MPS2, refused, run, samples_of, with_effects
@@ -49,12 +50,15 @@ def test_quantities_outside_are_counted_over_blocks_and_those_inside_are_not():
     calibration = calibrated(TCO)
     warm = np.array([25.0, 29.0, 35.0, np.nan, 41.0])
     whole = outside(calibration, {'temperature': warm})
-    blocks = SampleContext(calibration)
+    correction = Correction(calibration, calibration.units, '')
     for part in (warm[:0], warm[:2], warm[2:]):
-        blocks.of({'temperature': part}, len(part))
-    assert blocks.left == [whole['temperature']]
+        correction.context(Poses({'reading': np.zeros((len(part), 3)), 'temperature': part},
+                                 np.arange(len(part))))
     found = whole['temperature']
     assert (found.count, found.samples) == (2, 4)
+    noted, = correction.notes
+    assert noted.startswith('2 of 4 samples ')
+    assert outside_words(found) in noted
     assert (found.least, found.most) == (25.0, 41.0)
     assert outside(calibration, {'temperature': np.array([LOW, HIGH])})['temperature'].count == 0
     assert not outside(calibration, {'temperature': np.array([np.nan])})

@@ -13,7 +13,8 @@ import signal
 from typing import Any
 
 from accel_calib.errors import InputError, RefusedFitError
-from accel_calib.session import BUTTONS, conditions, enable, next_step, state, Surroundings
+from accel_calib.session import (
+    BUTTONS, conditions, enable, figures as health_figures, next_step, progress, Surroundings)
 from driven import Driver, GRAVITY, Person
 from inside import spread_directions
 import numpy as np
@@ -104,7 +105,7 @@ def test_every_person_ends_in_a_calibration_or_in_one_named_reason(
     driver.tick()
     found = conditions(driver.session.state)
     assert not case.named or case.named in [each.kind for each in found]
-    now, words = state.progress(driver.session.state), dict(state.figures(driver.session.state))
+    now, words = progress(driver.session.state), dict(health_figures(driver.session.state))
     assert (now.advice, now.step) == (found[0].next.text, found[0].next.kind)
     assert words['next'] == now.advice
     if case.named:
@@ -113,7 +114,8 @@ def test_every_person_ends_in_a_calibration_or_in_one_named_reason(
         assert wrong.words in driver.logged('warning')
     if case.ends == 'done':
         assert driver.calibration.is_levelled
-        np.testing.assert_allclose(np.linalg.norm(driver.sensor.gravity), GRAVITY, rtol=5e-3)
+        gravity = np.linalg.norm(driver.session.state.gravity)
+        np.testing.assert_allclose(gravity, GRAVITY, rtol=5e-3)
     assert len(person.called) == len(set(person.called)) or case.ends == 'done'
 
 
@@ -175,7 +177,7 @@ def test_bursts_of_absurd_readings_are_said_while_they_last_and_only_counted_the
     person.rest(person.flat, 8.0)
     assert next_step(driver.session.state).kind == 'done'
     assert driver.finding('stream').level == 'GOOD'
-    assert dict(state.figures(driver.session.state))['readings not finite'] == '10'
+    assert dict(health_figures(driver.session.state))['readings not finite'] == '10'
 
 
 def test_a_calibration_that_cannot_be_stored_leaves_no_file_and_is_asked_for_until_it_is(

@@ -3,12 +3,14 @@
 
 """Hidden effects are named and no others, on data of an independent generator."""
 
+from dataclasses import replace
 import re
 
 import accel_calib as ac
 from accel_calib.effects import between_steps
 from accel_calib.logs import read_poses
 from accel_calib.refinement import refine
+from accel_calib.table import numbered
 import generator
 from inside import LARGEST_SAMPLE, model_with, simulate_poses, spread_directions
 import numpy as np
@@ -153,6 +155,21 @@ def test_a_thermometer_with_steps_beside_a_ramp_does_not_hide_the_cause(seed, st
     assert found.remaining_gap_mg < 0.35  # the noise is 0.3, the steps are as much or more
 
 
+def test_intervals_beside_a_thermometer_with_steps_contain_the_truth():
+    """The errors of neighbouring poses are alike: they do not average out."""
+    true, away = np.array([16e-3, -8e-3, 8e-3]), []
+    for seed in range(12):
+        share = np.sort(np.random.default_rng(seed).uniform(size=60))
+        temperature = 20.3 + 12.0 * share
+        poses = ac.simulate({**SENSOR, 'offset_temperature': true}, poses=60, seed=seed,
+                            time=3600.0 * share, temperature=temperature)
+        step, = ac.refine(poses.with_columns(temperature=np.round(temperature)), base='10').steps
+        if step.effect == 'offset_temperature':  # else a drift, which explains a ramp as well
+            away += [(step.parameters[axis] - each) / step.parameters_sd[axis]
+                     for axis, each in zip('xyz', true)]
+    assert np.mean(np.abs(away) < 1.96) > 0.9
+
+
 @pytest.mark.parametrize('other', ['humidity', 'temperature'])
 def test_a_product_of_two_columns_is_named_and_stored(other, tmp_path):
     rng = np.random.default_rng(8)
@@ -278,6 +295,16 @@ def test_shared_orientation_shows_temperature_across_gravity():
     assert names(found) == ['offset_temperature']
     values = found.calibration.model.values['offset_temperature']
     np.testing.assert_allclose(values, [5e-4, 4e-4, -4e-4, 0.0, 0.0], atol=3e-5)  # without lag
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_rows_that_are_copies_are_no_further_evidence(seed, taken):
+    poses, _ = taken(seed, {'offset_temperature': 5.0}, poses=30)
+    again = poses.take(np.tile(np.arange(30), 2))
+    once, found = (refine(each, MPS2) for each in (
+        poses, replace(again, row=numbered(again.columns))))
+    assert [step.effect for step in found.steps] == [step.effect for step in once.steps]
+    assert found.remaining_gap_mg == pytest.approx(once.remaining_gap_mg)
 
 
 def test_a_long_table_is_refined_from_a_sample_and_says_so(monkeypatch):

@@ -13,7 +13,7 @@ from accel_calib.effects import Covariate
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.finding import Finding, has, LEVELS
 from accel_calib.logs import open_log, read_poses, write_table
-from accel_calib.session import CalibratorSettings, changed, next_step, state, Surroundings
+from accel_calib.session import CalibratorSettings, changed, next_step, progress, Surroundings
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Poses
 from driven import Driver, RATE
@@ -144,11 +144,11 @@ def test_sensor_that_tumbles_from_the_first_second_is_not_still_until_it_rests(
     up = np.column_stack([np.sin(turn) * np.cos(lean), np.sin(lean), np.cos(turn) * np.cos(lean)])
     for block in np.array_split((up + noise) * per_g, 120):
         driver.feed(block)
-        shown.append(state.progress(driver.session.state).still)
+        shown.append(progress(driver.session.state).still)
     assert not any(shown)
     for direction in (*spread_directions(5), np.array([0.6, 0.0, 0.8])):
         driver.feed((direction + noise[:150]) * per_g)
-    now = state.progress(driver.session.state)
+    now = progress(driver.session.state)
     assert now.still
     np.testing.assert_allclose(now.up, (0.6, 0.0, 0.8), atol=0.1)
 
@@ -430,11 +430,11 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
 
     expected, plain = (offline(each)[during].mean(axis=0) for each in (
         calibration, with_values(*values[:3])))
-    np.testing.assert_allclose(driver.sensor.gravity, expected, atol=0.01)
+    np.testing.assert_allclose(driver.session.state.gravity, expected, atol=0.01)
     assert abs(expected[2] - plain[2]) > 0.15
     offered = with_values(*values * [1.0, 1.0, 1.0, 2.0, 1.0])
     driver.session.change_sensor(offered=offered)
-    assert state.progress(driver.session.state).corrected == pytest.approx(
+    assert progress(driver.session.state).corrected == pytest.approx(
         np.linalg.norm(offline(offered)[-1]) / GRAVITY, abs=1e-3)
 
 
@@ -455,7 +455,7 @@ def test_the_heading_needs_a_level_mounting_and_the_nose_down(
     driver.refuses('within 10° of the flat pose', 'set_heading')
     put(driver, readings, NOSE_DOWN)
     driver.ask('set_heading')
-    np.testing.assert_allclose(driver.sensor.applied.rotation, MOUNTING, atol=0.01)
+    np.testing.assert_allclose(driver.session.state.applied.rotation, MOUNTING, atol=0.01)
 
 
 @pytest.mark.parametrize(('frame', 'axes'), [
@@ -473,13 +473,13 @@ def test_messages_are_specific_force_in_every_frame_also_after_a_restart_with_an
     for after in ('ros', frame):
         driver = Driver(calibration_file=str(path), frame=after)
         expected = MOUNTING @ (np.eye(3) if after == 'ros' else axes)
-        np.testing.assert_allclose(driver.sensor.applied.rotation, expected, atol=0.01)
+        np.testing.assert_allclose(driver.session.state.applied.rotation, expected, atol=0.01)
         put(driver, readings, UP)
-        gravity = driver.sensor.gravity / GRAVITY
+        gravity = driver.session.state.gravity / GRAVITY
         np.testing.assert_allclose(gravity, np.array(expected).T @ MOUNTING @ UP, atol=0.01)
         assert gravity[2] * (-1.0 if after == 'ned' else 1.0) > 0.99
         driver.ask('set_level')
-        np.testing.assert_allclose(driver.sensor.applied.rotation, expected, atol=0.01)
+        np.testing.assert_allclose(driver.session.state.applied.rotation, expected, atol=0.01)
         assert ('it is turned' in driver.logged('warning')) is (frame == 'android')
         driver.session.close()
 
@@ -492,7 +492,7 @@ def test_a_stored_mounting_of_the_documents_is_turned_before_it_is_used(
     flat, nose_down = found.predict(np.array([UP, NOSE_DOWN]) @ MOUNTING.T * GRAVITY)
     write_calibration(path, set_heading(level(found, flat, frame), nose_down))
     driver = Driver(calibration_file=str(path), frame='ned')
-    np.testing.assert_allclose(driver.sensor.applied.rotation,
+    np.testing.assert_allclose(driver.session.state.applied.rotation,
                                MOUNTING @ np.diag([1.0, -1.0, -1.0]), atol=1e-6)
     assert f'frame {frame},' in driver.logged('warning')
 

@@ -82,7 +82,7 @@ def test_the_gain_of_an_effect_is_that_of_a_fit_with_it(name, values):
     assert gain[best] == pytest.approx(state.fit.chi2 - after.fit.chi2, rel=0.01)
     chosen = Set.of(linear, (best,))
     assert linear.base_rss - chosen.rss == pytest.approx(gain[best], rel=1e-9)
-    np.testing.assert_allclose(chosen.values[best], after.model.values[name][:parameters],
+    np.testing.assert_allclose(chosen.parts[best], after.model.values[name][:parameters],
                                atol=0.02 * np.max(np.abs(values[:3])))
 
 
@@ -209,7 +209,7 @@ def test_effects_and_knocked_poses_are_found_and_nothing_in_noise(hidden, knocke
     _, linear = problem_of(poses_of(hidden, knocked=knocked), *tried)
     best = next(accepted(explored(linear)))
     assert (best.effects, best.out) == (tuple(hidden), knocked)
-    for found, true in zip(best.values.values(), hidden.values(), strict=True):
+    for found, true in zip(best.parts.values(), hidden.values(), strict=True):
         np.testing.assert_allclose(found, true[:3], atol=0.15 * max(true[:3]))
     if not hidden:
         assert best.score == 0.0
@@ -279,7 +279,7 @@ def test_whitened_equations_are_those_of_generalised_least_squares():
     assert onto.shape == (20, 0)
     assert left @ left == pytest.approx(residual @ inverse @ residual)
     values = np.linalg.solve(columns.T @ inverse @ columns, columns.T @ inverse @ residual)
-    found = Set.of(white, (0, 1)).values
+    found = Set.of(white, (0, 1)).parts
     np.testing.assert_allclose([found[0][0], found[1][0]], values)
     flat = replace(walk, ratio=0.0).whitened(linear)
     np.testing.assert_array_equal(Set.of(flat).spanned[1], residual)

@@ -22,30 +22,28 @@ from .directions import (
 from .fit import CLIPPED, fit_poses, fit_unknown, only_norm, rejected_by, sound_rows, sure_rows
 from .mounting import (
     flat_direction, in_frame, level, level_by_rows, on_topics, set_heading, with_given_mounting)
-from .outside import Outside, outside, SampleContext
 from .partial import fit_partial, fit_with_fleet, FleetPrior, mounting_only, posterior
 from .planning import (
     ENOUGH, next_pose, NextPose, plan_refinement, plan_session, PlannedPose, PosePlan,
     refuse_if_unfit, SessionPlan)
 from .quality import (
     deviations_g, errors_after, errors_before, fit_findings, gated, has_usual_gains, in_g,
-    LARGEST_OFFSET_G, OF_A_FIT, quality_of, record_of, stated_uncertainty, uncertainty_g,
-    Verification, verify, with_rest_noise)
+    LARGEST_OFFSET_G, OF_A_FIT, Outside, outside, quality_of, record_of, stated_uncertainty,
+    uncertainty_g, Verification, verify, with_rest_noise)
 from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise
 from .thermal import Curve, curve_of, thermal_alone, with_curve, without_curve
 
 __all__ = ['CLIPPED', 'ENOUGH', 'FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MODELS',
            'OF_A_FIT', 'ORIENTED', 'PRIOR', 'STORED_METHODS', 'Calibration', 'Combination',
            'Curve', 'FleetPrior', 'GyroBias', 'Identifiability', 'NextPose', 'Outside',
-           'PlannedPose', 'PosePlan', 'Quality', 'Rejected', 'RejectedKind', 'SampleContext',
-           'SampleNoise', 'SessionPlan', 'Verification', 'check_sensor', 'curve_of', 'determines',
-           'deviations_g', 'dilution', 'directions_in', 'directions_of', 'error_left_in',
-           'errors_after', 'errors_before', 'fit_findings', 'fit_partial', 'fit_poses',
-           'fit_unknown', 'fit_with_fleet', 'flat_direction', 'free_parameters', 'gated',
-           'gyro_bias_of', 'has_usual_gains', 'identifiability', 'in_frame', 'in_g', 'level',
-           'level_by_rows', 'lies_in_cone', 'lies_in_plane', 'mounting_only', 'next_pose',
-           'on_topics', 'only_norm', 'outside', 'plan_refinement', 'plan_session', 'posterior',
-           'quality_of', 'record_of', 'refuse_if_unfit', 'rejected_by', 'sample_noise_of',
-           'set_heading', 'sound_rows', 'stated_uncertainty', 'sure_rows', 'thermal_alone',
-           'uncertainty_g', 'verify', 'with_curve', 'with_given_mounting', 'with_rest_noise',
-           'without_curve']
+           'PlannedPose', 'PosePlan', 'Quality', 'Rejected', 'RejectedKind', 'SampleNoise',
+           'SessionPlan', 'Verification', 'check_sensor', 'curve_of', 'determines', 'deviations_g',
+           'dilution', 'directions_in', 'directions_of', 'error_left_in', 'errors_after',
+           'errors_before', 'fit_findings', 'fit_partial', 'fit_poses', 'fit_unknown',
+           'fit_with_fleet', 'flat_direction', 'free_parameters', 'gated', 'gyro_bias_of',
+           'has_usual_gains', 'identifiability', 'in_frame', 'in_g', 'level', 'level_by_rows',
+           'lies_in_cone', 'lies_in_plane', 'mounting_only', 'next_pose', 'on_topics', 'only_norm',
+           'outside', 'plan_refinement', 'plan_session', 'posterior', 'quality_of', 'record_of',
+           'refuse_if_unfit', 'rejected_by', 'sample_noise_of', 'set_heading', 'sound_rows',
+           'stated_uncertainty', 'sure_rows', 'thermal_alone', 'uncertainty_g', 'verify',
+           'with_curve', 'with_given_mounting', 'with_rest_noise', 'without_curve']

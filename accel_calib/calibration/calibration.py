@@ -5,9 +5,9 @@
 The record of a calibration, and the context in which it corrects readings.
 
 Effects are not extrapolated: beyond the range of the poses, the correction uses the limit of the
-range (`Calibration.ranges`), and `.outside` says how far beyond it was. A curve over the vibration
-has a range, too. A single sample does not show its vibration, so that the correction uses the
-lower limit.
+range (`Calibration.ranges`), and `.quality.outside` says how far beyond it was. A curve over the
+vibration has a range, too. A single sample does not show its vibration, so that the correction
+uses the lower limit.
 
 """
 

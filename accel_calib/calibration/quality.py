@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Figures and findings of a fit, its record, and the gate.
+Figures and findings of a fit, its record, the range of its poses, and the gate.
 
 The error of a pose is |force| - 1 g. For model 12 and poses of known orientation it is the length
 of the vector error. The residual of a calibration is the RMS of the errors over the poses.
@@ -29,15 +29,15 @@ from numpy.typing import NDArray
 from .calibration import Calibration, check_sensor, PRIOR, Quality, Rejected
 from .directions import WEAK_DILUTION
 from .rest_noise import gyro_bias_of, sample_noise_of
-from ..effects import add_history, correct, LADDER, length_rows, Model, sensor_force
+from ..effects import (
+    add_history, Context, correct, LADDER, length_rows, Model, sensor_force, variable_of)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import believable, Fit, judge, left_out, Rival, unseen_mistakes
 from ..finding import Finding, without
 from ..geometry import coverage, OVER_THE_SPHERE, unit
-from ..statistics import rms
 from ..table import Floats, in_unit, Poses
 from ..text import listed
-from ..units import MG, Units
+from ..units import MG, over_axes, rms, Units
 
 _LEAST_OWN = 1e-4
 """Below this part that other orientations check, one alone determines a parameter, and its error
@@ -86,6 +86,42 @@ class Verification:
     max_before_percent: float
     max_after_percent: float
     noise_floor_mg: float | None
+
+
+@dataclass(frozen=True)
+class Outside:
+    """
+    A column of the context, compared with the range of a calibration.
+
+    `count` of all `samples` are outside of the range `low` to `high` of the poses. All samples
+    range from `least` to `most`.
+
+    """
+
+    key: str
+    count: int
+    samples: int
+    low: float
+    high: float
+    least: float
+    most: float
+
+
+def outside(calibration: Calibration, known: Context) -> dict[str, Outside]:
+    """Return the comparison of each column that has a range; ``count`` is 0 if all are inside."""
+    found, ranges = {}, dict(calibration.ranges)
+    ends = [values[-2:] for name, values in calibration.model.values.items()
+            if variable_of(name) == 'std']
+    if ends:  # empirical curves over the vibration
+        ranges['std'] = float(np.max(ends, axis=0)[0]), float(np.min(ends, axis=0)[1])
+    for key, (low, high) in ranges.items():
+        values = over_axes(known[key]) if key in known else np.zeros(0)
+        values = values[np.isfinite(values)]
+        if len(values):
+            count = int(np.sum((values < low) | (values > high)))
+            found[key] = Outside(key, count, len(values), low=low, high=high,
+                                 least=float(np.min(values)), most=float(np.max(values)))
+    return found
 
 
 def in_g(poses: Poses, units: Units) -> Poses:

@@ -44,19 +44,17 @@ import numpy as np
 import scipy
 
 from .calibration import Calibration, PRIOR, Quality
-from .fit import only_norm
 from .quality import finished, gated, in_g, record_of
 from ..effects import (
-    add_history, Context, EFFECTS, entry_of, factors_of, Model, OFFSET_POWERS,
-    REFERENCE_TEMPERATURE, sensor_force)
+    add_history, Context, EffectKey, EFFECTS, entry_of, factors_of, Model, OFFSET_POWERS,
+    parameter_names, REFERENCE_TEMPERATURE, sensor_force, with_vector)
 from ..errors import InputError
 from ..estimate import judge
 from ..finding import Finding
 from ..geometry import coverage, unit
-from ..statistics import rms
 from ..stillness import Ramp
-from ..table import Floats, numbered, Poses, range_of
-from ..units import MG, Units
+from ..table import concatenated, Floats, numbered, Poses, range_of
+from ..units import MG, rms, Units
 
 _POWERS = OFFSET_POWERS[1:]
 _LINEAR, _RATE, _STEP = _POWERS[0], 'temperature_rate', 'offset_step'
@@ -88,7 +86,7 @@ as likely a bend that the effects lack."""
 _ROWS, _ROWS_OF_RATE = 24, 72
 """Number of rows that stand for a ramp among the poses of a calibration; if the rate acts."""
 
-_UNCHANGED = Model({_LINEAR: np.zeros(3)})
+_UNCHANGED: dict[EffectKey, Floats] = {_LINEAR: np.zeros(3)}
 """What is stored if the offset does not change."""
 
 Form = Mapping[str, Floats]
@@ -135,24 +133,26 @@ class Curve:
         """Return the degree of the polynomial in the temperature."""
         return sum(name in self.model.effects for name in _POWERS)
 
-    def _steady(self, temperature: Floats) -> Context:
-        """Return the context of a temperature that does not change, at the end of the ramps."""
-        time = np.full(len(temperature), np.max(self.stretches['time']))
-        return {'temperature': temperature, 'time': time, _RATE: np.zeros_like(temperature),
-                entry_of(_LINEAR).lagged: temperature}
-
     def at(self, temperature: Floats) -> Floats:
         """Return the (n, 3) offset at steady temperatures, relative to the reference [g]."""
-        every = np.append(temperature, self.reference_c)
-        found = np.zeros((len(every), 3)) + self.model.at(self._steady(every)).vec_v
-        return np.asarray(found[:-1] - found[-1])
+        return self._moved(temperature) @ self.model.vector
 
     def deviation_at(self, temperature: Floats) -> Floats:
         """Return the (n, 3) standard deviation of `at` [g]."""
-        found = _basis(self.model, [self._steady(np.append(temperature, self.reference_c))])
-        moved = found[:-1] - found[-1]
-        return np.sqrt(np.maximum(np.einsum(
-            'nap,pq,naq->na', moved, self.covariance, moved), 0.0))
+        moved = self._moved(temperature)
+        return np.sqrt(np.maximum(np.sum(moved @ self.covariance * moved, axis=2), 0.0))
+
+    def _moved(self, temperature: Floats) -> Floats:
+        """Return the (n, 3, p) derivative of `at` by the values of the model."""
+        found = self.steady_basis(self.model, np.append(temperature, self.reference_c))
+        return found[:-1] - found[-1]
+
+    def steady_basis(self, model: Model, temperature: Floats) -> Floats:
+        """Return the (n, 3, p) basis at temperatures that do not change, after the ramps."""
+        time = np.full(len(temperature), np.max(self.stretches['time']))
+        return _basis(model, [{
+            'temperature': temperature, 'time': time, _RATE: np.zeros_like(temperature),
+            entry_of(_LINEAR).lagged: temperature}])
 
     @property
     def band_mg(self) -> float:
@@ -170,17 +170,15 @@ class Curve:
         """Return what the effects leave of it, RMS of the vector [mg]."""
         return rms(np.linalg.norm(self.left, axis=1)) * MG
 
-    @property
-    def calibrated(self) -> tuple[Model, Floats]:
-        """Return the effects of a calibration, zero at the reference, and their covariance."""
-        found, covariance = (self.model, self.covariance) if self.model.effects else (
-            _UNCHANGED, np.zeros((len(_UNCHANGED.vector),) * 2))
-        if self.reference_c == REFERENCE_TEMPERATURE:
-            return found, covariance
-        here = self._steady(np.array([self.reference_c]))
-        to = np.vstack([-_basis(found, [here])[0], np.eye(len(found.vector))])
-        offset = -found.at(here).vec_v[0]
-        return Model({'offset': offset, **found.values}), to @ covariance @ to.T
+    def stored(self, *left_out: str) -> tuple[Model, Floats]:
+        """Return the effects that a calibration stores, and their covariance."""
+        model = Model({name: values for name, values in self.model.values.items()
+                       if name not in left_out} or _UNCHANGED)
+        covariance = np.zeros((len(model.vector),) * 2)
+        names, own = map(parameter_names, (model.effects, self.model.effects))
+        covariance[np.ix_(*[np.isin(names, own)] * 2)] = self.covariance[
+            np.ix_(*[np.isin(own, names)] * 2)]
+        return model, covariance
 
 
 @dataclass(frozen=True)
@@ -203,6 +201,10 @@ class _Board:
                  for name, shape in form.items()]
         return np.reshape(found, (len(form), len(self.levels))).T
 
+    def span(self, form: Form) -> Floats:
+        """Return the (n, r + k) orthonormal basis of levels and factors."""
+        return np.linalg.qr(np.column_stack([self.levels, self.columns(form)]))[0]
+
     def errors(self, form: Form) -> Floats:
         """
         Return the mean squared error of each part, predicted from a fit of the others [g²].
@@ -215,7 +217,7 @@ class _Board:
         way = np.abs(np.diff(warm, prepend=warm[0]))
         share = np.cumsum(way / max(float(way.sum()), 1e-9) + 1.0 / len(warm)) / 2.0
         parts = np.minimum((share * _BLOCKS).astype(np.intp), _BLOCKS - 1)
-        basis = np.linalg.qr(np.column_stack([self.levels, self.columns(form)]))[0]
+        basis = self.span(form)
         left = self.stretches.reading - basis @ (basis.T @ self.stretches.reading)
         found = []
         for part in np.unique(parts):
@@ -228,8 +230,7 @@ class _Board:
 
     def is_better(self, one: Floats, other: Floats) -> bool:
         """Return whether the first errors of held-out parts are clearly smaller."""
-        noise = 0.0 if self.stretches.noise is None else np.mean(
-            np.sum(self.stretches.noise ** 2, axis=1))
+        noise = np.mean(np.sum(self.stretches['std'] ** 2, axis=1) / self.stretches['count'])
         ours, theirs = (max(np.mean(each) - noise, 0.0) for each in (one, other))
         return bool(ours < (1.0 - _BETTER) ** 2 * theirs and np.mean(one < other) >= _MOST_BLOCKS)
 
@@ -239,8 +240,7 @@ class _Board:
         if name == _STEP and len(self.contexts) > 1:
             return []
         found = [np.zeros(0)] if effect.shapes is None else effect.shapes(self.contexts[0])
-        return [shape for shape in found
-                if name == _STEP or effect.is_lagged(shape) or not effect.lagged]
+        return [shape for shape in found if effect.is_lagged(shape) or not effect.lagged]
 
     def further(self, form: Form) -> Iterator[Form]:
         """Yield what can be tried in place of a form."""
@@ -251,8 +251,7 @@ class _Board:
         steady = {name: shape for name, shape in form.items() if name != _RATE}
         powers = {_LINEAR: np.array(EFFECTS[_LINEAR].usual),
                   **{name: shape for name, shape in form.items() if name in _POWERS}}
-        bases = [np.linalg.qr(np.column_stack([self.levels, self.columns(each)]))[0]
-                 for each in ({}, powers)]
+        bases = [self.span({}), self.span(powers)]
         for name in (*([] if _RATE in form or _lagged(form) else [_RATE]),
                      *([_LINEAR] if degree else [])):
             for shape in self.shapes(name):
@@ -276,11 +275,12 @@ class _Board:
             onto = np.linalg.pinv(design)[levels.shape[2]:]
             vector = model.vector.copy()
             vector[model.fitted] += onto @ (reading - self.predicted(model)).T.ravel()
-            found = dict(zip(model.effects, (vector[part] for part in model.terms.parts)))
+            found = with_vector(model.effects, vector)
             if model.lags:  # stay positive
-                found[_LINEAR][3] = np.clip(found[_LINEAR][3], *(
-                    np.array([0.5, 2.0]) * model.values[_LINEAR][3]))
-            model = Model(found)
+                before = model.values[_LINEAR][3]
+                found.values[_LINEAR][3] = np.clip(
+                    found.values[_LINEAR][3], 0.5 * before, 2.0 * before)
+            model = found
         covariance = np.zeros((len(model.vector),) * 2)
         covariance[np.ix_(model.fitted, model.fitted)] = self._covariance(
             np.column_stack([self.levels, self.columns({
@@ -297,9 +297,8 @@ class _Board:
         if name != _STEP:
             return bool(chance < _LEVEL)
         left = self.stretches.reading - self.predicted(model)
-        left[self.columns({_STEP: values[3:]})[:, 0] > 0.0] += size
         first = int(np.argmax(self.stretches['time'] >= values[3]))
-        jump = np.mean(left[first:first + _BESIDE], axis=0) - np.mean(
+        jump = size + np.mean(left[first:first + _BESIDE], axis=0) - np.mean(
             left[max(first - _BESIDE, 0):first], axis=0)
         return bool(len(self.shapes(_STEP)) * chance < _LEVEL and np.linalg.norm(size) > _LEAST_G
                     and jump @ size > 0.5 * size @ size)
@@ -351,20 +350,16 @@ def _basis(model: Model, contexts: Sequence[Context]) -> Floats:
 def curve_of(ramps: Sequence[Ramp]) -> Curve:
     """Return the effects of temperature from the ramps of one board, of any orientation."""
     tables, end = [], -np.inf
-    for each in (ramp.stretches for ramp in ramps):  # one after the other in time
+    for k, each in enumerate(ramp.stretches for ramp in ramps):  # one after the other in time
         time = each['time']
         if time[0] <= end:  # another clock
             time = time - time[0] + end + np.ptp(time)
-        tables.append(each.with_columns(time=time))
+        orientation = np.full(len(time), -1.0 - k)  # no number of a pose
+        tables.append(each.with_columns(time=time, orientation=orientation))
         end = float(time[-1])
-    group = np.repeat(np.arange(len(tables)), [len(each) for each in tables])
-    columns = {key: np.concatenate([each[key] for each in tables]) for key in tables[0].columns}
-    columns['orientation'] = -1.0 - group  # no number of a pose
-    first = tables[0]
-    stretches = Poses(columns, numbered(columns), 'g', first.sensor, first.autopilot)
-    levels = np.eye(len(tables))[group]
-    board = _Board(stretches, levels, [{key: each[key] for key in ('time', 'temperature', _RATE)}
-                                       for each in tables])
+    stretches = concatenated(tables)
+    levels = np.eye(len(tables))[-1 - stretches['orientation'].astype(np.intp)]
+    board = _Board(stretches, levels, [each.columns for each in tables])
     form: Form = {}
     errors = board.errors(form)
     held_out = {'': errors}
@@ -459,15 +454,20 @@ def thermal_alone(curve: Curve, units: Units, *, sensor: str = '', date: str = '
     Its residuals are the changes of the reading with the temperature, before and after.
 
     """
-    model, covariance = curve.calibrated
-    rows, noise = ramp_rows(curve, units), curve.stretches.noise
+    (model, covariance), rows = curve.stored(), ramp_rows(curve, units)
+    if curve.reference_c != REFERENCE_TEMPERATURE:
+        here = curve.steady_basis(model, np.array([curve.reference_c]))[0]
+        to = np.vstack([-here, np.eye(len(model.vector))])
+        model = Model({'offset': to[:3] @ model.vector, **model.values})
+        covariance = to @ covariance @ to.T
     before, after = (np.linalg.norm(each, axis=1) for each in (curve.change, curve.left))
+    noise = np.sqrt(np.sum(curve.stretches['std'] ** 2, axis=1) / curve.stretches['count'])
     quality = Quality(
         rms_before_mg=curve.change_mg, rms_after_mg=curve.residual_mg,
         max_before_percent=float(before.max()) * 100.0,
         max_after_percent=float(after.max()) * 100.0,
         held_out_rms_mg=[*curve.held_out_mg.values()][-1], chi2_per_dof=None,
-        noise_floor_mg=None if noise is None else rms(np.linalg.norm(noise, axis=1)) * MG,
+        noise_floor_mg=rms(noise) * MG,
         coverage=coverage(unit(rows.reading)))
     return finished(Calibration(
         name='ideal', method=PRIOR, model=model, units=units, sensor=rows.sensor, frame='ros',
@@ -496,20 +496,9 @@ def without_curve(curve: Curve, poses: Poses, units: Units) -> Poses:
         raise InputError('the poses have no temperature, expected one for each', 'record the '
                          'temperature with the poses, too, or name its column with --columns '
                          'temperature=NAME')
-    moved = poses.reading - units.from_g(_predict(curve, poses)[1])
+    model = curve.stored(_STEP)[0]  # the time of another log is another one
+    moved = poses.reading - units.from_g(model.at(add_history(poses, model).columns).vec_v)
     return poses.without_columns('reference', 'orientation').with_columns(reading=moved)
-
-
-def _predict(curve: Curve, poses: Poses) -> tuple[Model, Floats]:
-    """
-    Return the effects that act on poses of another log, and what they add to each [g].
-
-    It is relative to 25 °C. The time of the other log is another one: there is no step.
-
-    """
-    model = Model({name: values for name, values in curve.model.values.items() if name != _STEP})
-    known = add_history(poses, model).columns
-    return model, np.zeros((len(poses), 3)) + model.at(known).vec_v
 
 
 def with_curve(fitted: Calibration, curve: Curve, poses: Poses) -> Calibration:
@@ -521,32 +510,22 @@ def with_curve(fitted: Calibration, curve: Curve, poses: Poses) -> Calibration:
     the poses.
 
     """
-    used_g = in_g(fitted.used_poses, fitted.units)
-    thermal, added = _predict(curve, used_g)
-    if not thermal.effects:
-        thermal = _UNCHANGED
-    model, own = Model({**fitted.model.values, **thermal.values}), len(fitted.model.vector)
-    used_g = add_history(used_g, model)
-    moved = only_norm(used_g.with_columns(reading=used_g.reading + added))
-    known = {key: used_g[key] for key in ('time', 'temperature', _RATE) if key in used_g}
-    judged = judge(model, moved.with_columns(**known))
+    (thermal, of_curve), own = curve.stored(_STEP), len(fitted.model.vector)
+    model, units = Model({**fitted.model.values, **thermal.values}), fitted.units
+    used_g = in_g(poses.take(np.isin(poses.row, fitted.used_poses.row)), units)
+    judged = judge(model, add_history(used_g.without_columns('reference', 'orientation'), model))
     columns = judged.columns @ judged.ties.T
     move = -np.linalg.pinv(columns[:, :own]) @ columns[:, own:]
-    of_curve = np.zeros((len(thermal.vector),) * 2)
-    known_size = len(curve.model.vector) and len(of_curve)
-    of_curve[:known_size, :known_size] = curve.covariance[:known_size, :known_size]
     covariance = np.block([[fitted.covariance + move @ of_curve @ move.T, move @ of_curve],
                            [of_curve @ move.T, of_curve]])
-    rows = ramp_rows(curve, fitted.units)
-    own_rows = poses.with_columns(orientation=np.arange(1.0, len(poses) + 1.0))
-    every = replace(
-        poses, row=np.concatenate([poses.row, int(poses.row.max()) + rows.row]),
-        columns={key: np.concatenate([own_rows[key], values])
-                 for key, values in rows.columns.items() if key in own_rows})
+    rows = ramp_rows(curve, units)
+    every = concatenated([
+        poses.with_columns(orientation=np.arange(1.0, len(poses) + 1.0)),
+        replace(rows, row=int(poses.row.max()) + rows.row)])
     rejected = [each.row for each in fitted.rejected]
-    kept_g = add_history(in_g(every.take(~np.isin(every.row, rejected)), fitted.units), model)
+    kept_g = add_history(in_g(every.take(~np.isin(every.row, rejected)), units), model)
     made = record_of(
-        judge(model, kept_g), every, fitted.units, unit(sensor_force(
+        judge(model, kept_g), every, units, unit(sensor_force(
             model, kept_g.reading, kept_g.columns)), name=fitted.name, method=fitted.method,
         covariance=covariance, rejected=fitted.rejected,
         reason=f'{fitted.reason}; {_words(curve)}',

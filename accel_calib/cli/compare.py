@@ -12,8 +12,9 @@ from typing import Any
 from rich.table import Table
 
 from .commands import next_command
-from .frame import Done, FAILED, intake, log_options, read_lines, rows_between, stored_calibration
-from .output import NARROW, progress, short_if_known, table, Verdict
+from .frame import (
+    Done, FAILED, intake, log_options, NARROW, progress, read_lines, rows_between, short_if_known,
+    stored_calibration, table, Verdict)
 from ..calibration import verify
 from ..comparison import compare, history_of
 from ..errors import InputError

@@ -23,9 +23,8 @@ import numpy as np
 from rich.table import Table
 
 from .frame import (
-    check_target, console, Done, FAILED, given, intake, log_options, read_lines, rows_between,
-    stored_calibration, Target)
-from .output import Output, progress, short_if_known, table, Verdict, working
+    check_target, console, Done, FAILED, given, intake, log_options, Output, progress, read_lines,
+    rows_between, short_if_known, stored_calibration, table, Target, Verdict, working)
 from ..calibration import Calibration, NORM_MODELS
 from ..disk import STANDARD_OUTPUT, write_atomically
 from ..effects import AXES, entry_of, parse_effect

@@ -34,8 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with _leaving():
         from .commands import parser
         from .options import BAD_INPUT, in_one_line
-        from ..errors import AccelCalibError, crash_words, hide_warnings, known_error
-        from ..one_thread import use_one_thread
+        from ..errors import (
+            AccelCalibError, crash_words, hide_warnings, known_error, use_one_thread)
 
         use_one_thread()
         _open_streams()

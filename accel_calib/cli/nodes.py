@@ -31,8 +31,7 @@ from rich.table import Table
 from rich.text import Text
 
 from .commands import HIDDEN
-from .frame import console, Done, FAILED, given, log_options
-from .output import Output, table
+from .frame import console, Done, FAILED, given, log_options, Output, table
 from ..errors import InputError, NEEDS_ROS
 from ..geometry import words_of
 from ..stillness import CaptureSettings
@@ -74,8 +73,7 @@ def run_live(args: argparse.Namespace) -> Done:
     """Serve the live page without ROS until the user ends it."""
     from ..live import check_installed
     check_installed()
-    from ..live.host import Host
-    from ..live.sources import open_source
+    from ..live.host import Host, open_source
     from ..session import CalibratorSettings
 
     output = Output()

@@ -6,9 +6,9 @@ Effects: what each adds to the reading, and its properties.
 
 `form` defines what an effect is, and `catalogue` lists those with a known cause. `records` are
 effects beyond the catalogue: curves, with their formulas for a paper or for firmware, and
-covariates. `own` are those of a user, and `model` computes with a list of them. `way` finds how
-each pose was reached, `thermal` how the temperature lags and what it is between the steps of a
-thermometer, and `simulate` makes poses and recordings.
+covariates. `own` are those of a user, and `model` computes with a list of them. `thermal` finds
+how the temperature lags and what it is between the steps of a thermometer, and `history` how each
+pose was reached; it also simulates poses and recordings.
 
 An effect is one entry in `EFFECTS`. Simulation, fit, correction, search, report and documentation
 read it from there, so an effect that is added here works in all of them. Its contribution to the
@@ -39,6 +39,9 @@ from .catalogue import (
 from .form import (
     AFFINE, AXES, by_axis, Context, CUBE, Effect, EffectKey, EffectRecord, fitted_places, FORCE,
     MONOMIALS, ODD_SQUARE, ONE, PRODUCT, SIZE, SQUARE, TO_SEPARATE, WAVE, ZONAL, ZONES)
+from .history import (
+    add_acting, add_history, context_of_samples, FROM_TEMPERATURE, model_with, parse_effect,
+    simulate_poses, simulate_recording, thermal_stream, turn_between)
 from .model import (
     AtContext, check_context, CONVERGED_G, correct, EachShape, factors_of, LARGEST_FORCE_G,
     LARGEST_ITERATIONS, length_rows, linear_model, Model, own_slope, predict, sensor_force, times,
@@ -48,9 +51,7 @@ from .records import (
     CARRIERS, Covariate, COVARIATES, curves_over, effect_named, EMPIRICAL, EmpiricalCurve,
     formula_of, kind_of, modes_of, shown_name, unchanged, unit_of, value_unit, variable_of,
     variable_words, VARIABLES)
-from .simulate import model_with, parse_effect, simulate_poses, simulate_recording, turn_between
-from .thermal import acting_temperature, between_steps, rate_at, ThermalStream
-from .way import add_acting, add_history, context_of_samples, FROM_TEMPERATURE, thermal_stream
+from .thermal import acting_temperature, between_steps, covariance_of_steps, rate_at, ThermalStream
 
 __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CATALOGUE', 'CHANGES', 'CONVERGED_G', 'COVARIATES',
            'CUBE', 'EFFECTS', 'EMPIRICAL', 'FORCE', 'FROM_TEMPERATURE', 'LADDER',
@@ -60,10 +61,10 @@ __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CATALOGUE', 'CHANGES', 'CONVERGED_G', 
            'AtContext', 'Context', 'Covariate', 'EachShape', 'Effect', 'EffectKey', 'EffectRecord',
            'EmpiricalCurve', 'Model', 'ModelForm', 'OwnEffect', 'ParameterName', 'ThermalStream',
            'acting_temperature', 'add_acting', 'add_history', 'between_steps', 'by_axis',
-           'check_context', 'context_of_samples', 'correct', 'curves_over', 'effect_named',
-           'effects_of_file', 'entry_of', 'factors_of', 'fitted_places', 'formula_of', 'included',
-           'kind_of', 'length_rows', 'linear_model', 'linear_values', 'model_with', 'modes_of',
-           'own_effects', 'own_slope', 'parameter_names', 'parse_effect', 'predict', 'rate_at',
-           'sensor_force', 'shown_name', 'simulate_poses', 'simulate_recording', 'thermal_stream',
-           'times', 'too_large', 'turn_between', 'unchanged', 'unit_of', 'value_unit',
-           'variable_of', 'variable_words', 'with_vector']
+           'check_context', 'context_of_samples', 'correct', 'covariance_of_steps', 'curves_over',
+           'effect_named', 'effects_of_file', 'entry_of', 'factors_of', 'fitted_places',
+           'formula_of', 'included', 'kind_of', 'length_rows', 'linear_model', 'linear_values',
+           'model_with', 'modes_of', 'own_effects', 'own_slope', 'parameter_names', 'parse_effect',
+           'predict', 'rate_at', 'sensor_force', 'shown_name', 'simulate_poses',
+           'simulate_recording', 'thermal_stream', 'times', 'too_large', 'turn_between',
+           'unchanged', 'unit_of', 'value_unit', 'variable_of', 'variable_words', 'with_vector']

@@ -383,7 +383,7 @@ class Model(Record):
     @cached_property
     def _by_effect(self) -> list[tuple[Effect, Floats]]:
         """Effects with their shapes."""
-        return [(effect, effect.split(values)[1]) for effect, values in zip(
+        return [(effect, values[len(effect.parameters):]) for effect, values in zip(
             self.terms.effects, self.values.values(), strict=True)]
 
     @cached_property

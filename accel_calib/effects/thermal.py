@@ -24,7 +24,8 @@ process in them (Green and Silverman 1994, equations 2.1 and 2.2), the mean for 
 
     y - q² / 12 Q C⁻¹ Qᵀ y        C = q² / 12 QᵀQ + τ² R
 
-τ is that with the largest restricted likelihood. A temperature that jumps from pose to pose thus
+with the covariance q² / 12 (I - q² / 12 Q C⁻¹ Qᵀ), which enters that of the fitted values. τ is
+that with the largest restricted likelihood. A temperature that jumps from pose to pose thus
 remains as it is. The step is measured: readings that occur more than once are multiples of it.
 
 **Low pass.** The solution of the first equation is exact for the interpolated temperature: between
@@ -130,28 +131,67 @@ def _at_moments(time: Floats, temperature: Floats) -> tuple[Floats, NDArray[np.i
     return moments, place, np.bincount(place, temperature) / np.bincount(place)
 
 
+class _Steps(NamedTuple):
+    """
+    Temperatures in steps, with the symbols of the module.
+
+    The step [°C], the `known` rows, the (m,) `variance` at the moments and the `place` of each
+    known row among them; the rows of Qᵀ, the Cholesky factor of C in bands, and the (m,) mean.
+
+    """
+
+    step: float
+    known: NDArray[np.bool_]
+    place: NDArray[np.intp]
+    variance: Floats
+    rows: tuple[Floats, Floats, Floats]
+    root: Floats
+    mean: Floats
+
+
 def between_steps(time: Floats, temperature: Floats) -> Floats:
     """Return (n,) temperatures at poses [°C]; those in steps are estimated within half a step."""
+    found, estimated = _steps_of(time, temperature), temperature.copy()
+    if found is None:
+        return temperature
+    values, half = temperature[found.known], found.step / 2.0
+    estimated[found.known] = np.clip(found.mean[found.place], values - half, values + half)
+    return estimated
+
+
+def covariance_of_steps(time: Floats, temperature: Floats, onto: Floats) -> Floats:
+    """
+    Return the (p, p) covariance that the errors of `between_steps` cause, 0 without steps.
+
+    It is that of (p, n) sums of the errors. Errors of neighbouring poses are alike.
+
+    """
+    found = _steps_of(time, temperature)
+    if found is None:
+        return np.zeros((len(onto), len(onto)))
+    summed = np.array([np.bincount(found.place, row, len(found.mean))
+                       for row in onto[:, found.known]])
+    moved = summed * found.variance
+    across = sum(row * moved[:, k:k + len(row)] for k, row in enumerate(found.rows))
+    return np.asarray(summed @ moved.T - across @ scipy.linalg.cho_solve_banded(
+        (found.root, True), np.transpose(across)))
+
+
+def _steps_of(time: Floats, temperature: Floats) -> _Steps | None:
     known = np.isfinite(time) & np.isfinite(temperature)
-    values, estimated = temperature[known], temperature.copy()
+    values = temperature[known]
     different, count = np.unique(values, return_counts=True)
     repeated = different[count > 1]
     if len(repeated) < _LEAST_LEVELS or np.sum(count[count > 1]) < _REPEATED * len(values):
-        return temperature
+        return None
     step = float(np.min(np.diff(repeated)))
     steps = (repeated - repeated[0]) / step
     moments, place, mean = _at_moments(time[known], values)
     if (step > _COARSEST or np.max(np.abs(steps - np.round(steps))) > _ON_STEP
             or len(moments) < _LEAST_MOMENTS):
-        return temperature
-    spline = _spline(moments, mean, step ** 2 / 12.0 / np.bincount(place))
-    estimated[known] = np.clip(spline[place], values - step / 2.0, values + step / 2.0)
-    return estimated
-
-
-def _spline(time: Floats, mean: Floats, variance: Floats) -> Floats:
-    """Return the posterior means at n increasing times, of readings with (n,) variances."""
-    apart, best = np.diff(time) / np.median(np.diff(time)), (-np.inf, mean)
+        return None
+    variance = step ** 2 / 12.0 / np.bincount(place)
+    apart, best = np.diff(moments) / np.median(np.diff(moments)), -np.inf
     size, first, last = len(mean) - 2, 1.0 / apart[:-1], 1.0 / apart[1:]
     middle = -first - last
     of_error, of_process = np.zeros((2, 3, size))  # diagonals of the lower triangle
@@ -163,15 +203,16 @@ def _spline(time: Floats, mean: Floats, variance: Floats) -> Floats:
     of_process[0], of_process[1, :-1] = (apart[:-1] + apart[1:]) / 3.0, apart[1:-1] / 6.0
     across = first * mean[:-2] + middle * mean[1:-1] + last * mean[2:]
     for change in _CHANGES * np.max(variance):
-        root = scipy.linalg.cholesky_banded(of_error + change * of_process, lower=True)
-        solved = scipy.linalg.cho_solve_banded((root, True), across)
-        likelihood = -float(np.sum(np.log(root[0])) + across @ solved / 2.0)
-        if likelihood > best[0]:
-            moved = np.zeros(len(mean))
-            for row, part in enumerate((first, middle, last)):
-                moved[row:size + row] += part * solved
-            best = likelihood, mean - variance * moved
-    return best[1]
+        tried = scipy.linalg.cholesky_banded(of_error + change * of_process, lower=True)
+        off = scipy.linalg.cho_solve_banded((tried, True), across)
+        likelihood = -float(np.sum(np.log(tried[0])) + across @ off / 2.0)
+        if likelihood > best:
+            best, root, solved = likelihood, tried, off
+    moved = np.zeros(len(mean))
+    for k, row in enumerate((first, middle, last)):
+        moved[k:size + k] += row * solved
+    return _Steps(step, known, place, variance, (first, middle, last), root,
+                  mean - variance * moved)
 
 
 def _smoothed_rate(time: Floats, temperature: Floats) -> Floats:

@@ -58,9 +58,8 @@ import scipy
 
 from ..effects import Context, EachShape, EffectKey, Model, times
 from ..geometry import unit
-from ..statistics import NORMAL_95, over_axes, STATED_NOISE
 from ..table import Poses
-from ..units import Floats, Indices
+from ..units import Floats, Indices, NORMAL_95, over_axes, STATED_NOISE
 
 _BLOCK = 8192
 """Number of poses per block; their equations fit in the cache."""

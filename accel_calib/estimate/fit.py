@@ -183,6 +183,8 @@ class Fit:
         Known variance factor; None: from the residuals.
     beside : Fit or None
         The same beside a scatter of the poses, whose covariance it has.
+    of_context : (p, p) array or float
+        What errors in the context add to the covariance.
 
     """
 
@@ -195,6 +197,7 @@ class Fit:
     prior: Point | None = None
     factor: float | None = None
     beside: Fit | None = None
+    of_context: Floats | float = 0.0
 
     @cached_property
     def residual(self) -> Floats:
@@ -273,12 +276,12 @@ class Fit:
     def covariance(self) -> Floats:
         """(p, p) array, covariance of ``model.vector`` [g²]; 0 for values that are not fitted."""
         if self.beside is not None:
-            return self.beside.covariance
+            return self.beside.covariance + self.of_context
         columns, size = self._triangle
         if self.prior is not None:
             columns, size = _scaled(np.vstack([columns * size, self.prior.columns]))
         factor = self.ties @ (np.linalg.pinv(columns) / size[:, np.newaxis])
-        return np.asarray(factor @ factor.T * self.variance_factor)
+        return np.asarray(factor @ factor.T * self.variance_factor + self.of_context)
 
     @property
     def variance_factor(self) -> float:

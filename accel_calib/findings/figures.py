@@ -37,9 +37,8 @@ from ..effects import (
     value_unit)
 from ..estimate import pose_noise, sensing_axes, variance_factor
 from ..finding import NextStep, Rating
-from ..statistics import rms
 from ..text import signed
-from ..units import MG
+from ..units import MG, rms
 
 if TYPE_CHECKING:
     from ..refinement import Refinement
@@ -334,7 +333,7 @@ class Expected:
 
     def __init__(self, calibration: Calibration) -> None:
         quality, effects = calibration.quality, calibration.model.effects
-        self.calibration, self.quality = calibration, quality
+        self.calibration, self.quality, self.effects = calibration, quality, effects
         self.poses = calibration.used_poses
         self.directions = directions_in(self.poses, calibration)
         self.noise = pose_noise(self.poses.noise, self.directions)

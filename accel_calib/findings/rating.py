@@ -75,7 +75,7 @@ def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> R
 def _find_failures(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
     """Yield a finding if the calibration is refused, or the readings are as good without it."""
     if (refinement is not None and refinement.refusal
-            and expected.calibration.model.effects == refinement.calibration.model.effects):
+            and expected.effects == refinement.calibration.model.effects):
         message, advice = refinement.refusal
         yield Finding('refused', message, advice, 'BAD')
     own, before, is_partial = expected.own_mg, expected.before_mg, expected.is_partial
@@ -84,7 +84,7 @@ def _find_failures(expected: Expected, refinement: Refinement | None) -> Iterato
     if own > BAD_ERROR.value:
         yield Finding('error', f'the error in new orientations is {mg(own)}, expected at most '
                       f'{mg(BAD_ERROR.value)}', level='BAD', **_remedy(expected, refinement))
-    elif (expected.calibration.model.effects and not is_partial and before is not None
+    elif (expected.effects and not is_partial and before is not None
           and own > max(before, MATTERS.value)):
         yield Finding('no_gain', f'the error in new orientations is {mg(own)}, and {mg(before)} '
                       'without the calibration', level='BAD' if own > WORST_ERROR.value else
@@ -99,7 +99,7 @@ def _find_implausible(expected: Expected, refinement: Refinement | None) -> Iter
         yield Finding('held_out', 'orientations that the fit has not seen are wrong by '
                       f'{mg(held_out)}, expected at most {mg(BAD_ERROR.value)}', level='BAD',
                       **_remedy(expected, refinement))
-    if noise is None or expected.dof < TO_CHECK.value or not expected.calibration.model.effects:
+    if noise is None or expected.dof < TO_CHECK.value or not expected.effects:
         return
     rows = expected.outliers
     many = 100.0 * len(rows) > MANY_OUT.value * len(expected.calibration.poses)
@@ -116,7 +116,7 @@ def _find_implausible(expected: Expected, refinement: Refinement | None) -> Iter
 
 def _find_limits(expected: Expected) -> Iterator[Finding]:
     """Yield what the calibration is not for, and findings about poses that are left out."""
-    if not expected.calibration.model.effects:
+    if not expected.effects:
         yield Finding('mounting_alone', 'it is a mounting alone: offset and gain are not '
                       'calibrated', _more_poses(expected), 'USABLE')
     elif expected.is_partial and not expected.calibration.form.effects:
@@ -141,7 +141,7 @@ def _find_limits(expected: Expected) -> Iterator[Finding]:
 
 def _find_unchecked(expected: Expected) -> Iterator[Finding]:
     """Yield what the poses do not check."""
-    if expected.is_partial or not expected.calibration.model.effects:
+    if expected.is_partial or not expected.effects:
         return
     out = expected.outliers
     if expected.dof == 0:
@@ -172,13 +172,12 @@ def _find_unchecked(expected: Expected) -> Iterator[Finding]:
 
 def _find_missing(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
     """Yield what the poses show beside the model, and what later samples are not corrected for."""
-    effects = expected.calibration.model.effects
     if expected.is_beyond_noise:
         begin, step = f'{mg(expected.hidden_mg)} of the residual are not noise', 'poses'
         if refinement is None:
             what = f'{begin}: an effect is missing, or poses moved'
             advice, step = _REFINE, 'refine'
-        elif refinement.steps and effects != refinement.calibration.model.effects:
+        elif refinement.steps and expected.effects != refinement.calibration.model.effects:
             names = ' and '.join(step.effect for step in refinement.steps)
             what = f'{begin}; the model lacks {names}'
             advice, step = 'use the refined calibration', 'refine'
@@ -212,7 +211,7 @@ def _find_missing(expected: Expected, refinement: Refinement | None) -> Iterator
 def _find_inexact(expected: Expected, error: float, refinement: Refinement | None
                   ) -> Iterator[Finding]:
     """Yield a finding if an error that has no name yet is too large [mg]."""
-    if expected.is_partial or not expected.calibration.model.effects:
+    if expected.is_partial or not expected.effects:
         return
     large = error > GOOD_ERROR.value
     if large and expected.omitted_mg > max(GOOD_ERROR.value / 2.0, expected.own_mg):
@@ -270,8 +269,8 @@ def step_after(calibration: Calibration) -> NextStep:
 
 # ----------------------------------------------------------------------------- other results
 
-def rate_verification(verification: Verification, calibration: Calibration,
-                      poses: Poses | None = None) -> Rating:
+def rate_verification(verification: Verification, calibration: Calibration, poses: Poses
+                      ) -> Rating:
     """
     Rate a calibration by poses that it was not fitted to.
 
@@ -281,7 +280,7 @@ def rate_verification(verification: Verification, calibration: Calibration,
         Its residuals on these poses.
     calibration : Calibration
         The calibration.
-    poses : Poses, optional
+    poses : Poses
         These poses. If they cover only a part of the sphere, the rating is not better than that
         of the calibration itself.
 
@@ -308,14 +307,13 @@ def rate_verification(verification: Verification, calibration: Calibration,
         found.append(Finding('noise', f'the noise of these poses is {mg(floor)}, too large to see '
                              f'an error of {mg(GOOD_ERROR.value)}', 'hold the sensor longer in '
                              'each pose', 'USABLE'))
-    covered = 1.0 if poses is None else coverage(directions_in(poses, calibration))
+    covered = coverage(directions_in(poses, calibration))
     if expected.is_partial or covered < COVERED.value / 100.0:
         found += own.findings
     noise = 'noise not known' if floor is None else f'noise {mg(floor)}'
     figures = (f'{number(verification.rms_before_mg)} -> {mg(verification.rms_after_mg)}, '
-               f'largest {mg(verification.max_after_percent * MG / 100.0)}, {noise}')
-    if poses is not None:
-        figures += f', {counted(len(poses), "pose")}, {100.0 * covered:.0f} % of the sphere'
+               f'largest {mg(verification.max_after_percent * MG / 100.0)}, {noise}, '
+               f'{counted(len(poses), "pose")}, {100.0 * covered:.0f} % of the sphere')
     return rated(found, f'{what} ({degrees(error)} of tilt)', figures, step_after(calibration))
 
 

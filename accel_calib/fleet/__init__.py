@@ -6,7 +6,7 @@ Calibrations of many recordings on Dask: rows in a Parquet data set, grouped by 
 
 `recording` finds the recordings, names their sensors, and makes the row of one. `sensors` stores
 each row once, and compares the calibrations of each sensor over time. `overview` has the
-statistics and the typical values of the fleet, which `page` shows. `run` submits the tasks.
+statistics, the typical values and the page of the fleet. `run` submits the tasks.
 
 """
 

@@ -27,8 +27,7 @@ import threading
 import time
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from .overview import digest_of, overview, priors_of, rating_of
-from .page import write_fleet_page
+from .overview import digest_of, overview, priors_of, rating_of, write_fleet_page
 from .recording import (
     as_folder, content_hash, Input, key_of, on_disk, Options, Row, row_of, schema, unread_row)
 from .sensors import (
@@ -138,8 +137,7 @@ def cluster(address: str = '', workers: int | None = None) -> Iterator[Client]:
         try:
             if not address:
                 scratch = stack.enter_context(TemporaryDirectory(prefix='accel_calib-'))
-                stack.enter_context(dask.config.set(
-                    {**_CONFIG, 'temporary-directory': scratch}))
+                stack.enter_context(dask.config.set({**_CONFIG, 'temporary-directory': scratch}))
                 started: Any = stack.enter_context(LocalCluster(
                     n_workers=workers, threads_per_worker=1, host=_HERE,
                     dashboard_address=f'{_HERE}:0', silence_logs='ERROR'))
@@ -376,8 +374,7 @@ _apart = threading.local()
 """The process of each thread in which recordings are calibrated, so that it can be ended."""
 
 
-def calibrate_recording(found: Input, options: Options, store: Store, limit_s: float
-                        ) -> str | Row:
+def calibrate_recording(found: Input, options: Options, store: Store, limit_s: float) -> str | Row:
     """
     Calibrate one recording, add the result to the store, and return what happened to it.
 
@@ -394,8 +391,7 @@ def calibrate_recording(found: Input, options: Options, store: Store, limit_s: f
                 return 'skipped'
             if not hasattr(_apart, 'process'):
                 _apart.process = WorkerProcess(idle=False)  # ends with this process
-            row, calibration = _apart.process.call(
-                row_of, found, path, options, limit_s=limit_s)
+            row, calibration = _apart.process.call(row_of, found, path, options, limit_s=limit_s)
         row |= {'key': key, 'content': content, 'seconds': time.perf_counter() - begin}
         if calibration is not None:
             name = f'calibrations/{as_folder(row["sensor"])}/{key}.yaml'

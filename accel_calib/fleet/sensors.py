@@ -196,13 +196,13 @@ def write_parquet(path: Path, rows: list[Row], columns: pa.Schema) -> None:
                                                        write_page_checksum=True))
 
 
-def read_parquet(path: Path, columns: Sequence[str] | None = None) -> list[Row]:
-    """Return the rows of a Parquet file, with all columns or these; none without a file."""
+def read_parquet(path: Path) -> list[Row]:
+    """Return the rows of a Parquet file; none without a file."""
     import pyarrow.parquet as pq
 
     if not path.exists():
         return []
-    return pq.ParquetFile(path, page_checksum_verification=True).read(columns).to_pylist()
+    return pq.ParquetFile(path, page_checksum_verification=True).read().to_pylist()
 
 
 def is_damaged(path: Path) -> bool:

@@ -4,9 +4,9 @@
 """
 The live page: a calibration in a browser, served by the node or without ROS.
 
-`server` serves the page and the messages of each `viewer`. `exchange` makes the messages of a
-session: that of the node, or that of `host` with the samples of `sources`. `page` contains the
-files for the browser.
+`server` serves the page. `exchange` makes the messages of a session, and its viewers send and
+receive them. The session is that of the node, or that of `host` with samples of another source.
+`page` contains the files for the browser.
 
 """
 

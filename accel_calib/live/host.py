@@ -2,40 +2,98 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A session without ROS behind the live page.
+A session without ROS behind the live page, with samples of a serial port or a recording.
 
-The host takes samples from a source, which is a recording or a serial port. One thread does all
-that changes the session: it takes samples, runs commands, and finishes jobs. The source must
-therefore yield a block, which can be empty, after a short time. After its end, the page and its
-commands continue to work.
+A source yields blocks of samples without waiting for long: a block can be empty. So the one thread
+of the host does all that changes the session: it takes samples, runs commands, and finishes jobs.
+After the end of the source, the page and its commands continue to work.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import replace
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
+from itertools import chain
+import math
+from pathlib import Path
 from queue import Empty, SimpleQueue
 import re
+import time
 from time import monotonic
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
-from .exchange import Exchange
+from .exchange import Exchange, PERIOD
 from .server import PAGE, PageServer
-from .viewer import PERIOD
-from ..errors import AccelCalibError, known_error
+from ..errors import AccelCalibError, InputError, known_error, needing
+from ..finding import Finding
+from ..logs import LineReader, LogOptions, open_log
 from ..session import (
     BATCH, CalibratorSettings, Event, Log, Session, Severity, Surroundings, Throttle, Worker)
-from ..table import Floats
-
-if TYPE_CHECKING:
-    from .sources import Source
+from ..stillness import samples_of
+from ..table import Floats, Recording
+from ..units import Units
 
 _TICK = 1.0
 """Interval between two checks of the stream [s]."""
+
+_WAIT_S = 0.03
+"""Longest time without a block [s]."""
+
+_HEAD_S = 2.0
+"""Time over which the first lines of a port are collected [s]."""
+
+_HEAD_LINES, _HEAD_CHARACTERS = 20, 1 << 18
+"""Fewest first lines, and number of characters after which no more are collected: each takes some
+150 bytes while the lines are recognised."""
+
+_PATIENCE_S = 10.0
+"""Time without a line that is understood after which a port is refused [s]."""
+
+_LONGEST_LINE = 4096
+"""Longest line of a port [bytes]."""
+
+_AGAIN_S = 1.0
+"""Interval between two attempts to open a port that was removed [s]."""
+
+_LONGEST_GAP_S = 5.0
+"""Longer gaps in a recording are not waited for [s]."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """
+    Samples as they arrive; `open_source` makes it.
+
+    Parameters
+    ----------
+    name : str
+        The port or the recording.
+    sensor : str
+        Name of the sensor; empty if it is not known.
+    units : Units
+        Unit of the readings.
+    read_as : str
+        How they are read, in one line; empty if nothing is assumed.
+    blocks : iterator of (n, 9) array
+        The samples, as for `accel_calib.stillness.StillDetector.push`. A block can be empty.
+    findings : tuple of Finding
+        What was decided by the first values, against what they seem to be.
+    problem : callable
+        Function that returns why no samples come at present; empty if nothing is wrong.
+
+    """
+
+    name: str
+    sensor: str
+    units: Units
+    read_as: str
+    blocks: Iterator[Floats]
+    findings: tuple[Finding, ...] = ()
+    problem: Callable[[], str] = str
 
 
 class Host:
@@ -137,7 +195,213 @@ class Host:
 
     def _show(self, event: Event) -> None:
         if isinstance(event, Log):
-            self._print(replace(event, words=re.sub(
+            self._print(event._replace(words=re.sub(
                 r'(call )?~/(\w+)', lambda found: f'{"press " if found[1] else ""}'
                 f'{self._labels.get(found[2], found[0])}', event.words)))
         self.exchange.show_event(event)
+
+
+# ----------------------------------------------------------------------------- sources
+
+def is_port(name: str) -> bool:
+    """Return whether a name is that of a serial port, and not of a recording."""
+    return '://' in name or name.upper().startswith(('COM', '/DEV/')) or (
+        Path(name).is_char_device())
+
+
+@contextmanager
+def open_source(name: str, options: LogOptions, *, baud: int, speed: float = 1.0
+                ) -> Iterator[Source]:
+    """
+    Open a serial port, or a recording.
+
+    Parameters
+    ----------
+    name : str
+        Device of the port or its URL (``socket://HOST:PORT``), or file of the recording.
+    options : LogOptions
+        How to read it; by default it is recognised.
+    baud : int
+        Baud rate of the port.
+    speed : float
+        Speed of the recording, relative to real time.
+
+    Raises
+    ------
+    InputError
+        If it cannot be opened or read, or sends no samples; also while it is read.
+    OSError
+        If the file cannot be read.
+
+    """
+    if is_port(name):
+        port = _Port()
+        with closing(port.lines(name, baud)) as arriving:
+            reader = _understood(name, arriving, options, baud)
+            first = [] if reader.first is None else [_rows(reader.first)]
+            blocks = (rows for lines in arriving for rows in _rows_of(reader, lines))
+            yield Source(name, sensor='', units=reader.units, read_as=reader.read_as,
+                         blocks=_in_order(chain(first, blocks)), findings=reader.findings,
+                         problem=lambda: port.problem)
+        return
+    with open_log(Path(name), options) as log:
+        yield Source(name, log.sensor, log.units, log.read_as,
+                     blocks=_played(log.blocks, speed), findings=log.findings)
+
+
+# ----------------------------------------------------------------------------- a recording
+
+def _played(blocks: Iterator[Recording], speed: float) -> Iterator[Floats]:
+    """Yield the samples of a recording when they are due."""
+    shift = last = -np.inf
+    for block in blocks:
+        rows = _rows(block)
+        due, done = np.maximum.accumulate(rows[:, 0]) / speed, 0
+        while done < len(rows):
+            now = time.monotonic()
+            if due[done] - last > _LONGEST_GAP_S / speed:
+                shift = due[done] - now
+            ready = int(np.searchsorted(due, now + shift, side='right'))
+            gaps = np.flatnonzero(np.diff(due[done:ready]) > _LONGEST_GAP_S / speed)
+            ready = max(done, done + int(gaps[0]) + 1 if len(gaps) else ready)
+            yield rows[done:ready]
+            if ready > done:
+                last, done = due[ready - 1], ready
+            time.sleep(_WAIT_S)
+
+
+def _rows(recording: Recording) -> Floats:
+    rows = np.full((len(recording), 9), np.nan)
+    columns = samples_of(recording, 0, len(recording))
+    rows[:, :len(columns)] = columns.T
+    return rows
+
+
+# ----------------------------------------------------------------------------- a serial port
+
+_RETURN = ('connect the sensor again; the page continues when it is back, and the poses are '
+           'kept')
+
+
+class _Port:
+    """A serial port; `problem` is why it sends nothing at present, empty if it is open."""
+
+    problem = ''
+
+    def lines(self, name: str, baud: int) -> Generator[list[str], None, None]:
+        """
+        Yield complete lines, or none after a moment; the first one, maybe cut, is left out.
+
+        The port is opened again when it returns after it was removed. InputError if it cannot be
+        opened at the start.
+
+        """
+        with needing('pyserial', 'a serial port'):
+            import serial
+        port: Any = None
+        rest, is_cut, tried = b'', True, -math.inf
+        try:
+            while True:
+                found = b''
+                if port is None and time.monotonic() - tried >= _AGAIN_S:
+                    is_first, tried = tried < 0.0, time.monotonic()
+                    try:
+                        port = serial.serial_for_url(name, baudrate=baud, timeout=_WAIT_S)
+                        self.problem = ''
+                    except (OSError, ValueError) as err:  # SerialException is an OSError
+                        problem = InputError(
+                            f'{name} cannot be opened: {err}', 'check its name, whether another '
+                            'program uses it, and your rights (on Linux: group dialout)')
+                        if is_first:
+                            raise problem from err
+                        self.problem = f'{problem.message}: {_RETURN}'
+                if port is None:
+                    time.sleep(_WAIT_S)
+                else:
+                    try:
+                        found = port.read(port.in_waiting or 1)
+                    except OSError as err:
+                        port.close()
+                        port, rest, is_cut = None, b'', True
+                        self.problem = f'{name} does not send any more ({err}): {_RETURN}'
+                *lines, rest = (rest + found).split(b'\n')
+                rest = rest[-_LONGEST_LINE:]
+                if lines and is_cut:
+                    lines, is_cut = lines[1:], False
+                yield [line[:_LONGEST_LINE].decode('utf-8', errors='replace').rstrip('\r')
+                       for line in lines]
+        finally:
+            if port is not None:
+                port.close()
+
+
+def _understood(name: str, lines: Iterator[list[str]], options: LogOptions, baud: int
+                ) -> LineReader:
+    """Return the reader of the lines, as soon as the first ones are understood."""
+    head: list[str] = []
+    count = size = 0
+    arrived: list[tuple[int, float]] = []
+    begin = tried = time.monotonic()
+    problem = InputError(f'{name} sends no lines, expected one line for each sample',
+                         'check the sensor and its program')
+    for new in lines:
+        now = time.monotonic()
+        if new and not head:
+            begin = tried = now
+        if new:
+            head += new if size < _HEAD_CHARACTERS else []
+            count, size = count + len(new), size + sum(map(len, new))
+            arrived.append((count, now))
+        if now - tried >= _HEAD_S and len(head) >= _HEAD_LINES and (
+                arrived[-1][1] - arrived[0][1] > _WAIT_S):
+            tried = now
+            try:
+                return LineReader(name, head, _interval(arrived), options)
+            except InputError as err:
+                problem = err
+        if now - begin > _PATIENCE_S:
+            break
+    raise InputError(problem.message, f'{problem.advice}; check the baud rate {baud}, too '
+                     '(--baud)')
+
+
+def _interval(arrived: list[tuple[int, float]]) -> float:
+    """
+    Return the time from line to line [s], from the number of lines at times [s].
+
+    It is the median of the slopes between times half of the list apart (Theil 1950), which neither
+    a backlog at the start nor lines that are late at the end change much. Of the times within
+    each `_WAIT_S` the last one counts, because a backlog can take many short reads.
+
+    """
+    count, seconds = np.array([*{int(at / _WAIT_S): (n, at) for n, at in arrived}.values()]).T
+    half = len(count) // 2
+    return float(np.median((seconds[half:] - seconds[:-half]) / (count[half:] - count[:-half])))
+
+
+def _in_order(blocks: Iterable[Floats]) -> Iterator[Floats]:
+    """
+    Leave out single samples whose time is not between those before and after.
+
+    Lost characters make such times. If a board starts again, its times stay smaller, and all
+    samples are kept. The last sample waits for the next one.
+
+    """
+    held = np.full((1, 9), np.nan)  # a sample that was yielded, and the one that waits
+    for block in blocks:
+        rows = np.concatenate([held, block])
+        before, time, after = rows[:-2, 0], rows[1:-1, 0], rows[2:, 0]
+        is_wrong = (before <= after) & ((time < before) | (time > after))
+        yield rows[1:-1][~is_wrong]
+        held = rows[-2:]
+
+
+def _rows_of(reader: LineReader, lines: list[str]) -> Iterator[Floats]:
+    """Yield the samples of lines; a line whose numbers are impossible is left out."""
+    try:
+        recording = reader.samples(lines) if lines else None
+        yield np.empty((0, 9)) if recording is None else _rows(recording)
+    except InputError:
+        if len(lines) > 1:  # a lost character can make a number too large
+            for line in lines:
+                yield from _rows_of(reader, [line])

@@ -37,9 +37,9 @@ from urllib.parse import urlsplit
 
 from aiohttp import web
 
-from .exchange import Exchange
-from .viewer import (
-    announce, Board, LARGEST, Message, PERIOD, reachable, secured, STUCK_S, TooManyError, Viewer)
+from .exchange import (
+    announce, Board, Exchange, LARGEST, Message, PERIOD, reachable, secured, STUCK_S, TooManyError,
+    Viewer)
 from ..errors import InputError
 from ..report import policy
 from ..session import Answer, Throttle
@@ -201,7 +201,7 @@ class PageServer:
             self._link_file.unlink(missing_ok=True)
 
     def announce(self) -> str:
-        """Show the link to its owner alone, and return a log line; see `viewer.announce`."""
+        """Show the link to its owner alone, and return a log line; see `exchange.announce`."""
         words, self._link_file = announce(self.link, f'live_page_{self._port}.txt')
         return words
 

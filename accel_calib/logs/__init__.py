@@ -6,25 +6,24 @@ Reader of logs: text of any dialect, bags, flight logs of PX4 and ArduPilot, and
 
 `open_log` recognises the format, the columns and the units. What it assumed is one line,
 `OpenLog.read_as`, and what it left out is in `OpenLog.notes`. `child` reads binary files in a
-process with limits. `serialized` defines the places of the fields in serialized messages.
+process with limits. `bag` defines the places of the fields in serialized messages.
 
 """
 
 from .autopilot import ARDUPILOT_REFERENCE, ByAxis, DEGREE, PER_MILLION
-from .bag import imus_of, open_bag
-from .bag_samples import field_of, messages_of
+from .bag import (
+    ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
+    doubles_at, IMU_DOUBLES, imus_of, joined, Layout, layout_of, layout_with, LITTLE_ENDIAN,
+    Messages, NAME_AT, NINE, open_bag, ORIENTATION, ORIENTATION_COVARIANCE, put_doubles, renamed,
+    samples_of, STAMP, STAMP_AT, THREE)
+from .bag_samples import field_of, messages_of, named_topics, topic_and_field
 from .child import parts_of
-from .columns import LogOptions, named_topics, topic_and_field
+from .columns import LogOptions
 from .containers import Frame, Piped
 from .formats import (
     BAG, FORMATS, is_bag, open_log, OpenLog, Progress, read_poses, read_recording, SUFFIXES)
 from .names import NAMES
 from .quantities import are_samples
-from .serialized import (
-    ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
-    doubles_at, IMU_DOUBLES, joined, Layout, layout_of, layout_with, LITTLE_ENDIAN, Messages,
-    NAME_AT, NINE, ORIENTATION, ORIENTATION_COVARIANCE, put_doubles, renamed, samples_of, STAMP,
-    STAMP_AT, THREE)
 from .text import LineReader, write_blocks, write_table
 
 __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',

@@ -307,19 +307,9 @@ class Message:
         return f'{self.name} {self.instance}'
 
 
-@dataclass(frozen=True)
-class FlightLog:
-    """
-    The samples of one sensor of a flight log, in m/s².
-
-    The sensor is message and number, such as ``sensor_accel 0``. Notes state what was not used,
-    and what to know of the readings.
-
-    """
-
-    recording: Recording
-    read_as: str
-    notes: tuple[str, ...]
+FlightLog = tuple[Recording, str, tuple[str, ...]]
+"""Samples of one sensor, such as ``sensor_accel 0``, in m/s²; how they are read; and notes: what
+was not used, and what to know of the readings."""
 
 
 @dataclass(frozen=True)
@@ -353,7 +343,7 @@ class Choice:
         if 'temperature' in columns:
             read_as += f', {temperature}'
         recording = Recording(columns, numbered(columns), 'm/s2', self.sensor, autopilot)
-        return FlightLog(recording, read_as, (*notes, *self.notes, *more))
+        return recording, read_as, (*notes, *self.notes, *more)
 
     def rates(self, time: Floats, sources: Iterable[Message], names: Sequence[str]
               ) -> dict[str, Floats]:

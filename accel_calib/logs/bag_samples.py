@@ -18,7 +18,7 @@ first messages of the Imu, converts this time to that of the stamps.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Generator, Iterator, Sequence
+from collections.abc import Collection, Container, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 from operator import attrgetter
@@ -28,12 +28,12 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .bag import Bag, BLOCK, imus_of, NUMBERS, open_bag, Received, TEMPERATURE, types_of
-from .columns import topic_and_field
+from .bag import (
+    Bag, BLOCK, doubles_at, imus_of, NANO, NUMBERS, open_bag, Received, stamps_of, TEMPERATURE,
+    types_of)
 from .names import ZEROS
-from .serialized import doubles_at, NANO, stamps_of
 from ..errors import InputError
-from ..table import concatenated, CONTEXT, Floats, Recording
+from ..table import concatenated, CONTEXT, Floats, quantity_key, Recording
 from ..text import counted, listed, some
 
 if TYPE_CHECKING:
@@ -51,6 +51,35 @@ FIRST_MESSAGES = 100
 
 _SAME_CLOCK_S = 60.0
 """Largest difference of a stamp from the time of receipt; a larger one is another clock."""
+
+
+def named_topics(entries: Iterable[str]) -> dict[str, str]:
+    """
+    Return the topic, with its field if one is named, of each column of the context.
+
+    An entry is ``column:=topic`` or ``column:=topic/field``; InputError if one is not usable.
+
+    """
+    topics: dict[str, str] = {}
+    for entry in filter(None, entries):
+        column, _, topic = (part.strip() for part in entry.partition(':='))
+        known = column in (*CONTEXT, quantity_key(column))
+        if not (known and column and topic) or column in topics:
+            raise InputError(
+                f'context has the entry {entry!r}, expected column:=topic or column:=topic/field, '
+                f'each column once: {", ".join(CONTEXT)}, or a new name of letters, digits and '
+                '_', 'correct the entry')
+        topics[column] = topic
+    return topics
+
+
+def topic_and_field(asked: str, topics: Container[str]) -> tuple[str, str]:
+    """Return the topic that a text names among those that exist, and the field or ''."""
+    topic, field_of = asked, ''
+    while topic and topic not in topics:
+        topic, _, last = topic.rpartition('/')
+        field_of = f'{last}.{field_of}' if field_of else last
+    return (topic, field_of) if topic else (asked, '')
 
 
 @dataclass(frozen=True)

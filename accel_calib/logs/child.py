@@ -47,9 +47,8 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from ..errors import AccelCalibError, DamagedLogError, InputError, saying
+from ..errors import AccelCalibError, DamagedLogError, InputError, ONE_THREAD, saying
 from ..finding import Finding
-from ..one_thread import ONE_THREAD
 from ..table import Autopilot, Poses, Recording
 from ..text import reason
 from ..units import Units

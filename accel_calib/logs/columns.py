@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Columns of a text log: which column of a header holds which of our columns.
+Columns of a text log: the records of a table of text, and which column holds which of ours.
 
 What the user names goes first, then our own names, then the maker's layout, then the words of
 other names. A table without header is read by the number of its columns. Two accelerometers that
@@ -11,20 +11,25 @@ the names cannot tell apart are an error, because a wrong choice would give a wr
 """
 
 from collections import Counter
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+import csv
 from dataclasses import dataclass, field
+import math
+from pathlib import Path
 import re
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .dialect import Cells, is_clock, is_number, Layout, shown
 from .names import (
     BARE, bare_name, check_sensor, COMPUTED_WORDS, COUNTERS, folded, format_named, FREE_WORDS,
     LINEAR_WORDS, LogFormat, Meaning, meaning, OURS, RATE, READING, recognise, unit_of, UNITS,
     WHOLE_WORDS, WORDS)
 from ..errors import InputError
 from ..table import COLUMNS, CONTEXT, Floats, quantity_key
+from ..text import some
 from ..units import STANDARD_GRAVITY, UnitName
 
 FRACTION = 'time_ns'
@@ -39,40 +44,39 @@ OF_POSES = {'count', 'orientation', 'std'}
 """Columns that only poses have."""
 
 
-def named_topics(entries: Iterable[str]) -> dict[str, str]:
-    """
-    Return the topic, with its field if one is named, of each column of the context.
-
-    An entry is ``column:=topic`` or ``column:=topic/field``; InputError if one is not usable.
-
-    """
-    topics: dict[str, str] = {}
-    for entry in filter(None, entries):
-        column, _, topic = (part.strip() for part in entry.partition(':='))
-        known = column in (*CONTEXT, quantity_key(column))
-        if not (known and column and topic) or column in topics:
-            raise InputError(
-                f'context has the entry {entry!r}, expected column:=topic or column:=topic/field, '
-                f'each column once: {", ".join(CONTEXT)}, or a new name of letters, digits and '
-                '_', 'correct the entry')
-        topics[column] = topic
-    return topics
-
-
-def topic_and_field(asked: str, topics: Container[str]) -> tuple[str, str]:
-    """Return the topic that a text names among those that exist, and the field or ''."""
-    topic, field_of = asked, ''
-    while topic and topic not in topics:
-        topic, _, last = topic.rpartition('/')
-        field_of = f'{last}.{field_of}' if field_of else last
-    return (topic, field_of) if topic else (asked, '')
-
-
 _FIRST_ROWS = 5
 """Number of rows that show whether a column has numbers, dates or other text."""
 
 MOST = 5000
 """Number of columns among which names other than our own are looked for."""
+
+
+MONITOR = re.compile(r'^(\d{1,2}:\d{2}:\d{2}(?:\.\d+)?) -> ')
+"""Time that the serial monitor of the Arduino IDE puts before a line."""
+
+LABEL = re.compile(r'(?:^|(?<=[\s,;|]))[A-Za-z_][A-Za-z_0-9 .]*?(?:\s*[:=]\s*|\s+)(?=[-+.\d])')
+"""Name before a number, as the serial plotter of the Arduino IDE has it: ``ax:0.01``, ``x 1``."""
+
+LABELLED_UNIT = re.compile(r'(?<=[\d.]) *(?:m?g|m/s(?:\^?2|²|/s)|(?:°|deg|rad)/s|dps|°?C)'
+                           r'(?=[\s,;|]|$)')
+"""Unit after a number with a name."""
+
+CLOCK = re.compile(
+    r'(?:(\d{4}[-/]\d{1,2}[-/]\d{1,2}|\d{1,2}-[A-Za-z]{3}-\d{4}|\d{1,2}[./]\d{1,2}[./]\d{4})'
+    r',?[T ])?(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,:](\d+))?)? ?([AaPp]\.?[Mm]\.?)? ?'
+    r'(Z|UTC|[-+]\d{2}(?::?\d{2})?)?', re.ASCII)
+"""Date, which may be absent, and time of the day."""
+
+RATES_HZ = (1.0, 10_000.0)
+"""Plausible numbers of samples per second."""
+
+EPOCH_S = (1e9, 4e9)
+"""Unix times from 2001 to 2096 [s]."""
+
+_DELIMITER_WORDS = {'\t': 'tab', '': 'blanks', '|': "'|'", ';': "';'"}
+_NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?', re.ASCII)
+UNREADABLE = re.compile('[\x00-\x08\x0e-\x1a\x1c-\x1f\x7f\ufffd]')
+_SHOWN_CHARACTERS = 40
 
 
 @dataclass(frozen=True)
@@ -130,6 +134,108 @@ class LogOptions:
 
 
 @dataclass(frozen=True)
+class Dialect:
+    """
+    How the cells of a table are parted; an empty delimiter is any run of blanks.
+
+    `monitor`: each line begins with the time of a serial monitor. `labelled`: each number follows
+    its name. `prefix`: begin of the lines that are rows, and `marks`: those of lines that are not.
+
+    """
+
+    delimiter: str
+    monitor: bool = False
+    labelled: bool = False
+    prefix: str = ''
+    marks: tuple[str, ...] = ('#', '//', '%')
+
+    def is_row(self, line: str) -> bool:
+        """Return whether a line can be a row."""
+        return not (line.startswith(self.marks) or line.isspace()) and self.prefix in line
+
+    def cells(self, line: str) -> list[str]:
+        """
+        Return the cells of a line, without quotes and blanks around them, and without names.
+
+        The time of a monitor is the first cell.
+
+        """
+        delimiter = self.delimiter
+        if self.monitor:
+            line = MONITOR.sub(lambda found: found[1] + (delimiter or ' '), line)
+        line = line.removeprefix(self.prefix)
+        if self.labelled:
+            line = LABEL.sub('', LABELLED_UNIT.sub('', line))
+        cells = line.split(delimiter or None)
+        if '"' in line:
+            with suppress(csv.Error):  # A cell is longer than 131,072 characters.
+                cells = next(csv.reader(
+                    [line], delimiter=delimiter or ' ', skipinitialspace=True), [])
+        return [cell.strip() for cell in cells]
+
+
+@dataclass(frozen=True)
+class TextLayout:
+    """
+    Where the table of a text file begins, and how its cells are parted.
+
+    `decimal` is the decimal mark, empty if the first rows have whole numbers only. `units_row` are
+    the cells of a row of units below the `header`; both are empty if there are none. `width` is
+    the number of cells in a row, and `start` that of lines before the first row. `about` has units
+    and sensor from the comments, `notes` what was skipped before the table, and `sample` the cells
+    of the first rows. `rate_hz` is the rate of the samples that the lines before the table state.
+
+    """
+
+    path: Path
+    dialect: Dialect
+    decimal: str
+    header: tuple[str, ...]
+    units_row: tuple[str, ...]
+    width: int
+    start: int
+    encoding: str = 'utf-8'
+    about: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    sample: tuple[tuple[str, ...], ...] = ()
+    rate_hz: float | None = None
+
+    @property
+    def words(self) -> list[str]:
+        """Return what differs from a plain CSV table."""
+        words = ('' if self.encoding in ('utf-8', 'utf-8-sig') else self.encoding.upper(),
+                 _DELIMITER_WORDS.get(self.dialect.delimiter, ''),
+                 'decimal comma' if self.decimal == ',' else '',
+                 'names before the numbers' if self.dialect.labelled else '',
+                 '' if self.header else 'no header')
+        return list(filter(None, words))
+
+    def first(self, column: int) -> list[str]:
+        """Return the first cells of a column."""
+        return [row[column] for row in self.sample if column < len(row)]
+
+    def name(self, column: int) -> str:
+        """Return the name of a column, or its number from 1."""
+        has_name = column < len(self.header) and self.header[column]
+        return short(self.header[column]) if has_name else str(column + 1)
+
+
+@dataclass(frozen=True)
+class Cells:
+    """A block of rows: numbers and texts by the index of the column, and row numbers from 1."""
+
+    numbers: Mapping[int, Floats]
+    texts: Mapping[int, NDArray[np.object_]]
+    row: NDArray[np.int64]
+
+    def take(self, which: NDArray[np.bool_] | slice) -> 'Cells':
+        """Return the rows at these indices, or where this mask is true."""
+        numbers = {k: values[which] for k, values in self.numbers.items()}
+        texts = {k: values[which] for k, values in self.texts.items()}
+        return Cells(numbers, texts, self.row[which])
+
+
+@dataclass(frozen=True)
 class Source:
     """A column of a file: its index, its name, and the text of its unit."""
 
@@ -150,7 +256,7 @@ class Chosen:
 
     """
 
-    layout: Layout
+    layout: TextLayout
     sources: Mapping[str, tuple[Source, ...]]
     maker: LogFormat | None
     needed: tuple[int, ...]
@@ -172,6 +278,27 @@ class Chosen:
         return [source.name for source in self.sources[key]]
 
 
+def is_number(text: str) -> bool:
+    """Return whether a cell is a finite number, with a decimal point."""
+    return _NUMBER.fullmatch(text) is not None and math.isfinite(float(text))
+
+
+def is_clock(text: str) -> bool:
+    """Return whether a text is a date with a time, or a time of the day."""
+    return CLOCK.fullmatch(text) is not None
+
+
+def short(text: str) -> str:
+    """Return the beginning of a text for a message, without characters that cannot be read."""
+    text = UNREADABLE.sub('', text[:10 * _SHOWN_CHARACTERS]).strip()
+    return text if len(text) <= _SHOWN_CHARACTERS else f'{text[:_SHOWN_CHARACTERS]}…'
+
+
+def shown(names: Sequence[str]) -> str:
+    """Return the names of columns for a message."""
+    return some(map(short, names))
+
+
 def is_log_header(options: LogOptions, cells: Sequence[str]) -> bool:
     """Return whether cells are the names of the columns of a log."""
     theirs = [name.casefold() for name in options.columns.values()
@@ -182,7 +309,7 @@ def is_log_header(options: LogOptions, cells: Sequence[str]) -> bool:
             or recognise(cells[:MOST]) is not None)
 
 
-def choose_columns(layout: Layout, options: LogOptions) -> Chosen:
+def choose_columns(layout: TextLayout, options: LogOptions) -> Chosen:
     """
     Return the columns of a log that are used.
 
@@ -240,7 +367,7 @@ def _are_numbers(cells: Sequence[str]) -> bool:
     return all(is_number(cell.replace(',', '.')) for cell in cells)
 
 
-def _sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
+def _sources(layout: TextLayout, given: Mapping[str, str]) -> dict[str, Source]:
     """Return columns under our names; `given` are those that the user or a maker names."""
     header = layout.header
     for ours in given:
@@ -270,7 +397,7 @@ def _sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
     return {ours: source for ours, source in plain.items() if given.get(ours, ours)}
 
 
-def column(layout: Layout, theirs: str) -> Source:
+def column(layout: TextLayout, theirs: str) -> Source:
     """Return a column by its name, in any case, or by its number."""
     header = layout.header
     same = ([k for k, name in enumerate(header) if name == theirs]
@@ -286,7 +413,7 @@ def column(layout: Layout, theirs: str) -> Source:
     return _source(layout, same[0])
 
 
-def _source(layout: Layout, index: int) -> Source:
+def _source(layout: TextLayout, index: int) -> Source:
     """Return a column with its unit, which can stand in a row below the header."""
     unit = meaning(layout.header[index]).unit if index < len(layout.header) else ''
     if not unit and index < len(layout.units_row):
@@ -295,7 +422,7 @@ def _source(layout: Layout, index: int) -> Source:
     return Source(index, layout.name(index), unit)
 
 
-def _readings(layout: Layout) -> dict[str, Source]:
+def _readings(layout: TextLayout) -> dict[str, Source]:
     """Return the columns of the accelerometer; those of a table without header by their order."""
     header = layout.header
     if not header:
@@ -367,7 +494,7 @@ def _bare(header: Sequence[str]) -> list[list[int]]:
     return [[axes[axis][k] for axis in range(3)] for k in range(count)]
 
 
-def _contexts(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
+def _contexts(layout: TextLayout, found: Mapping[str, Source]) -> dict[str, Source]:
     more: dict[str, Source] = {}
     header = layout.header
     # Columns of times that run, and how finely. A date that stays the same, or a time of the day
@@ -402,14 +529,14 @@ def _contexts(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
     return more
 
 
-def _counter(layout: Layout) -> Source | None:
+def _counter(layout: TextLayout) -> Source | None:
     """Return the column that counts the samples, or None."""
     return next((_source(layout, k) for k, name in enumerate(layout.header[:MOST])
                  if bare_name(name) in COUNTERS and len(layout.first(k)) >= _FIRST_ROWS
                  and _step_of(layout, k) > 0.0), None)
 
 
-def _step_of(layout: Layout, index: int) -> float:
+def _step_of(layout: TextLayout, index: int) -> float:
     """Return the median step between the first numbers of a column; 0 if they are no numbers."""
     cells = layout.first(index)
     if len(cells) < 2 or not all(map(is_number, cells)):
@@ -417,7 +544,7 @@ def _step_of(layout: Layout, index: int) -> float:
     return float(np.median(np.diff([float(cell) for cell in cells])))
 
 
-def rates_beside(layout: Layout, time: Source) -> list[float]:
+def rates_beside(layout: TextLayout, time: Source) -> list[float]:
     """Return the rates of the rows that the file states [Hz]: in words, or by another clock."""
     rates = []
     counted = _counter(layout)
@@ -430,7 +557,7 @@ def rates_beside(layout: Layout, time: Source) -> list[float]:
     return rates
 
 
-def _fraction(layout: Layout, best: int) -> dict[str, Source]:
+def _fraction(layout: TextLayout, best: int) -> dict[str, Source]:
     """Return the column of the nanoseconds beside whole seconds, as ROS stamps have it."""
     known = meaning(layout.header[best])
     if unit_of('time', known.unit) == ('s', 1.0):

@@ -41,8 +41,7 @@ import numpy as np
 import scipy
 
 from .child import LogFile
-from .columns import BY_ORDER, is_log_header, LogOptions
-from .dialect import shown
+from .columns import BY_ORDER, is_log_header, LogOptions, shown
 from ..errors import InputError
 from ..table import ABOUT
 from ..text import read_json, some

@@ -48,7 +48,7 @@ from numpy.typing import NDArray
 from .autopilot import (
     ardupilot_correction, at, choose, FlightLog, Message, Parameters, px4_correction, px4_slot,
     sound, vectors)
-from .names import MICRO, PX4_FIELDS, PX4_SPANS
+from .names import MICRO, names_of, PX4_FIELDS
 from ..errors import InputError
 from ..table import Autopilot
 from ..text import counted
@@ -64,9 +64,9 @@ _INVALID = 0x7fffffff
 
 _RELATIVE = 'accelerometer_timestamp_relative'
 _RAW = 'sensor_accel'
-_MORE = {'sensor_combined': (_RELATIVE,), 'vehicle_imu': tuple(PX4_SPANS.values())}
-_NEEDED = {name: {*chain(*fields.values()), *_MORE.get(name, ())}
-           for name, fields in PX4_FIELDS.items()}
+_NEEDED = {name: {*chain(*map(names_of, patterns.values()))}
+           for name, patterns in PX4_FIELDS.items()}
+_NEEDED['sensor_combined'].add(_RELATIVE)
 
 
 class _WholeReads(io.BufferedReader):
@@ -101,16 +101,16 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     choice = choose(known, PX4_MESSAGES, topic, sensor, str(path))
     chosen = choice.message
     fields, time = chosen.fields, chosen.time
-    columns = {key: vectors(fields, names) for key, names in PX4_FIELDS[chosen.name].items()}
+    columns = {key: vectors(fields, names_of(pattern))
+               for key, pattern in PX4_FIELDS[chosen.name].items()}
     valid = np.ones(len(time), dtype=bool)
     if _RELATIVE in fields:
         relative = fields[_RELATIVE].astype(float)
         time, valid = time + relative * MICRO, relative != _INVALID
-    for key, name in PX4_SPANS.items():
-        if name in fields:
-            seconds = fields[name] * MICRO
-            valid &= seconds > 0.0
-            columns[key] /= np.where(seconds > 0.0, seconds, 1.0)[:, np.newaxis]
+    for key in [key for key in columns if key.endswith('/')]:
+        seconds = columns.pop(key) * MICRO
+        valid &= seconds[:, 0] > 0.0
+        columns[key[:-1]] /= np.where(seconds > 0.0, seconds, 1.0)
     columns, invalid = sound(
         chosen, {'time': time, **columns}, 'PX4 marks them as invalid', valid)
     time = columns['time']

@@ -26,13 +26,11 @@ from typing import Any
 import numpy as np
 
 from . import containers
-from .autopilot import FlightLog
 from .bag import open_bag
 from .bag_samples import context_of, FIRST_MESSAGES, imu_samples
 from .child import LogFile, parts_of
-from .columns import Chosen, LogOptions
+from .columns import Chosen, LogOptions, shown
 from .containers import Frame, Member, Piped, Stream
-from .dialect import shown
 from .flight import DATAFLASH, read_dataflash, read_ulg
 from .names import meaning, record_instead
 from .quantities import are_samples, decide_quantities
@@ -41,7 +39,7 @@ from ..disk import check_regular, FIRST_LINE
 from ..errors import DamagedLogError, InputError, needing, saying
 from ..finding import Finding
 from ..table import check_units, check_values, concatenated, CONTEXT, Poses, Recording
-from ..text import counted, some
+from ..text import counted
 from ..units import Units, units_of
 
 _HEAD, _TAIL = 8192, 65536
@@ -117,17 +115,16 @@ def _bag(_: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
 
 @contextmanager
 def _flight(known: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
-    log: FlightLog = known.read(path, options.topic, options.instance)
-    recording = log.recording
+    recording, read_as, notes = known.read(path, options.topic, options.instance)
     check_values(recording.columns, str(path))
     units = units_of('m/s2', options.gravity)
     if options.units not in ('', units.name):
         raise InputError(f'{path} is in {units.name}, but --units is {options.units}',
                          'remove --units')
-    with saying(log.read_as):
+    with saying(read_as):
         check_units(recording, units, str(path))
-    yield OpenLog(iter((recording,)), len(recording), units, recording.sensor, log.read_as,
-                  noted=lambda: log.notes)
+    yield OpenLog(iter((recording,)), len(recording), units, recording.sensor, read_as,
+                  noted=lambda: notes)
 
 
 # ------------------------------------------------------------------------------- binary files
@@ -260,12 +257,14 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
                 count = max(count, int(text.size / width / max(text.characters, 1) * count))
         else:
             rows = concatenated([head, *blocks])
-            lacking = [] if options.partial else [
-                key for key in (*CONTEXT, *rows.quantities)
-                if key in rows and not np.isfinite(rows[key]).all()]
-            if lacking:
-                quantities.notes.append(
-                    f'not used, because cells are not numbers: {some(lacking)}')
+            holes = {} if options.partial else {
+                key: np.flatnonzero(~np.isfinite(rows[key]))
+                for key in (*CONTEXT, *rows.quantities) if key in rows}
+            lacking = [key for key, empty in holes.items() if len(empty)]
+            quantities.findings += [
+                Finding('columns', f'not used, because {len(holes[key])} of {len(rows)} cells are '
+                        f'not numbers: {key}', 'fill in these cells, or remove their rows',
+                        rows=tuple(rows.row[holes[key]].tolist())) for key in lacking]
             if 'time' not in rows and are_samples(rows.columns):
                 raise InputError(
                     f'{path} has no times, but its {len(rows)} rows look like samples of a '

@@ -24,7 +24,7 @@ depends on the sign. A flat pose does, and `LogFormat.note` names the frame for 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from functools import lru_cache
+from functools import cached_property, lru_cache
 import math
 from pathlib import Path
 import re
@@ -252,11 +252,11 @@ class LogFormat:
     """
     One layout of a text log, named as ``--format`` has it.
 
-    `columns` are the names in the file of our columns. With a key of `COLUMNS`, ``KEY/`` is the
-    name of the column by which ours are divided; ``instance`` is that of the number of the sensor,
-    if rows of several alternate. By such a key, `scales` are factors from the unit of the file to
-    ours; a time without one is in a unit that the reader recognises. `units` is the unit of the
-    reading, empty if the file does not determine it.
+    `patterns` are the names in the file, by key of `COLUMNS`; letters in braces are those of the
+    axes. ``KEY/`` is the name of the column by which those of a key are divided; ``instance`` is
+    that of the number of the sensor, if rows of several alternate. By key, `scales` are factors
+    from the unit of the file to ours; a time without one is in a unit that the reader recognises.
+    `units` is the unit of the reading, empty if the file does not determine it.
 
     The names of time, readings, divisors and `marks` together determine the layout if it is
     `plain`; otherwise it is used only where the user names it. `without_gravity` are the maker's
@@ -267,7 +267,7 @@ class LogFormat:
     """
 
     name: str
-    columns: Mapping[str, str]
+    patterns: Mapping[str, str]
     scales: Mapping[str, float] = field(default_factory=dict)
     units: UnitName | Literal[''] = 'm/s2'
     marks: tuple[str, ...] = ()
@@ -276,6 +276,12 @@ class LogFormat:
     record: str = ''
     note: str = ''
     plain: bool = True
+
+    @cached_property
+    def columns(self) -> dict[str, str]:
+        """Names in the file of our columns, such as ``ax``."""
+        return {ours: theirs for key, pattern in self.patterns.items() for ours, theirs in zip(
+            COLUMNS[key].names if key in COLUMNS else (key,), names_of(pattern))}
 
     @property
     def needed(self) -> tuple[str, ...]:
@@ -295,145 +301,95 @@ def folded(name: str) -> str:
     return ' '.join(name.strip().strip('"\'').split()).casefold().replace('²', '^2')
 
 
-_LOWER, _UPPER, _BY_NUMBER = ('x', 'y', 'z'), ('X', 'Y', 'Z'), ('0', '1', '2')
+def names_of(pattern: str) -> tuple[str, ...]:
+    """Return a name for each of the letters in braces of a pattern, or the only name."""
+    before, brace, rest = pattern.partition('{')
+    letters, _, after = rest.partition('}')
+    return tuple(f'{before}{letter}{after}' for letter in letters) if brace else (pattern,)
 
-
-def _axes(pattern: str, keys: Sequence[str] = READING, names: Sequence[str] = _LOWER
-          ) -> dict[str, str]:
-    """Return a name for each axis; ``{}`` in the pattern stands for the axis."""
-    return {key: pattern.replace('{}', name) for key, name in zip(keys, names)}
-
-
-# ---------------------------------------------------------------------------- phyphox
-# https://github.com/phyphox/phyphox-android
-# The data sets of the app's own experiments, and of those made with "Add simple experiment".
-# Both apps multiply by ±9.81 so that a phone with its screen up reads +z.
-
-_PHYPHOX_FORMATS = tuple(
-    LogFormat('phyphox', {'time': 'Time (s)', **_axes(pattern)}, {'time': 1.0},
-              without_gravity=(
-                  *_axes('Linear Acceleration {} (m/s^2)').values(), 'Linear Acceleration.csv',
-                  'Linear Accelerometer.csv', 'Acceleration without g.csv'),
-              record="record 'Acceleration with g' (Raw sensors) in phyphox")
-    for pattern in ('Acceleration {} (m/s^2)', '{} (m/s^2)'))
-
-# ------------------------------------------------------------------- Physics Toolbox
-# https://www.vieyrasoftware.net
-# The g-force meter has gravity; ax, ay, az beside it are the linear acceleration.
-
-_TOOLBOX = LogFormat('physics-toolbox', {'time': 'time', **_axes('gF{}'), **dict(zip(
-    RATE, ('wx', 'wy', 'wz')))}, {'rate': 1.0}, 'g', READING)
-
-# ---------------------------------------------------------------------- Sensor Logger
-# https://github.com/tszheichoi/awesome-sensor-logger/blob/main/UNITS.md
-# One file per sensor with the same header; the name of the file is the name of the sensor.
-
-_LOGGER = LogFormat(
-    'sensor-logger', {'time': 'seconds_elapsed', **_axes('{}')}, {'time': 1.0}, '', ('time',),
-    without_gravity=('Accelerometer.csv',),
-    other_sensors=('Gravity.csv', 'Gyroscope.csv', 'GyroscopeUncalibrated.csv', 'Magnetometer.csv',
-                   'MagnetometerUncalibrated.csv'),
-    record='use TotalAcceleration.csv (Android) or AccelerometerUncalibrated.csv of Sensor Logger',
-    note='Readings in g are those of an iPhone, with the opposite sign: a flat pose needs '
-         '--frame win8.')
-
-# ---------------------------------------------------------------------- MATLAB Mobile
-# https://www.mathworks.com/help/matlabmobile/ug/logging-accelerometer-data.html
-# The timetable Acceleration, written by writetimetable; or sensorlog_accel_*.csv of a phone's
-# local log, where the time is in ms of Unix time.
-
-_MATLAB_FORMATS = tuple(
-    LogFormat('matlab', {'time': time, **_axes('{}', names=_UPPER)}, plain=False)
-    for time in ('Timestamp', 'Time'))
-
-# ------------------------------------------------------------------------------- PX4
-# https://docs.px4.io/main/en/msg_docs/
-# One file for each topic, <log>_<topic>_<instance>.csv, written by ulog2csv of pyulog; the columns
-# are the fields of the messages SensorAccel, SensorCombined, VehicleImu and VehicleAcceleration.
 
 _FRD = ('Axes are x forward, y right, z down, so that a level vehicle reads -1 g on z; --flat '
         'turns them to x forward, y left, z up.')
 
-
-PX4_FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
-    message: {key: (*_axes(pattern, names=names).values(),) for key, pattern in patterns.items()}
-    for message, names, patterns in (
-        ('sensor_accel', _LOWER, {'reading': '{}'}),
-        ('sensor_combined', _BY_NUMBER, {'reading': 'accelerometer_m_s2[{}]',
-                                         'rate': 'gyro_rad[{}]'}),
-        ('vehicle_imu', _BY_NUMBER, {'reading': 'delta_velocity[{}]', 'rate': 'delta_angle[{}]'}),
-        ('vehicle_acceleration', _BY_NUMBER, {'reading': 'xyz[{}]'}))}
-"""Fields of the messages with accelerations, in order of preference, by key of `COLUMNS`."""
-
-PX4_SPANS = {'reading': 'delta_velocity_dt', 'rate': 'delta_angle_dt'}
-"""Interval [µs] in which a change of velocity or angle was measured."""
-
-
-def _px4(message: str, marks: tuple[str, ...] = (), note: str = _FRD, *, changes: bool = False,
-         **others: str) -> LogFormat:
-    """Return the layout of a message; `changes` are divided by their intervals."""
-    spans = PX4_SPANS if changes else {}
-    return LogFormat(
-        'px4', {'time': 'timestamp', **others, **{
-            axis: name for key, names in PX4_FIELDS[message].items()
-            for axis, name in zip(COLUMNS[key].names, names)},
-            **{f'{key}/': name for key, name in spans.items()}},
-        {'time': MICRO, **dict.fromkeys(spans, 1.0 / MICRO)}, marks=marks, note=note)
-
-
-_PX4_FORMATS = (
-    _px4('sensor_accel', ('device_id', 'error_count'), temperature='temperature'),
-    _px4('sensor_combined', note='Readings are corrected by the stored CAL_ACC parameters; those '
-                                 f'of sensor_accel are not. {_FRD}'),
-    _px4('vehicle_imu', changes=True),
-    _px4('vehicle_acceleration', ('timestamp_sample',)))
-
-# -------------------------------------------------------------------------- ArduPilot
-# https://ardupilot.org/copter/docs/logmessages.html
-# mavlogdump.py --format csv --types IMU (or ACC) writes the fields of the message after its own
-# timestamp.
-
-_ACC = _axes('Acc{}', names=_UPPER)
-
-_ARDUPILOT_FORMATS = tuple(
-    LogFormat('ardupilot', {'time': time, **_ACC, **more, 'instance': 'I'}, {'time': MICRO},
-              marks=marks, note=f'Readings are corrected by the stored INS_ACC parameters. {_FRD}')
-    for time, more, marks in (
-        ('TimeUS', {**_axes('Gyr{}', RATE, _UPPER), 'temperature': 'T'}, ('GyrX',)),
-        ('SampleUS', {}, ('TimeUS',)),
-        ('TimeUS', {}, ())))
-
-# ------------------------------------------------------------------------- Betaflight
-# https://github.com/betaflight/blackbox-tools
-# blackbox_decode, whose options --unit-frame-time, --unit-acceleration and --unit-rotation add the
-# unit to the name, and the export of the Blackbox Explorer. Without units the readings are counts
-# (acc_1G of the log's header per g), and the unit of the gyro is not in the file.
+PX4_FIELDS: Mapping[str, Mapping[str, str]] = {
+    'sensor_accel': {'reading': '{xyz}'},
+    'sensor_combined': {'reading': 'accelerometer_m_s2[{012}]', 'rate': 'gyro_rad[{012}]'},
+    'vehicle_imu': {'reading': 'delta_velocity[{012}]', 'reading/': 'delta_velocity_dt',
+                    'rate': 'delta_angle[{012}]', 'rate/': 'delta_angle_dt'},
+    'vehicle_acceleration': {'reading': 'xyz[{012}]'}}
+"""Fields of the messages of PX4 with accelerations, in order of preference, as in
+`LogFormat.patterns`; changes of velocity and angle are divided by their intervals [µs]."""
 
 _BLACKBOX_TIMES = {'time (us)': MICRO, 'time (ms)': MILLI, 'time (s)': 1.0, 'time': MICRO}
 _BLACKBOX_UNITS: dict[str, UnitName] = {'': 'native', ' (g)': 'g', ' (m/s/s)': 'm/s2'}
-_BLACKBOX_RATES: tuple[tuple[dict[str, str], float], ...] = (
-    (_axes('gyroADC[{}] (deg/s)', RATE, _BY_NUMBER), DEGREE_RAD),
-    (_axes('gyroADC[{}] (rad/s)', RATE, _BY_NUMBER), 1.0), ({}, 0.0))
+_BLACKBOX_RATES = {'gyroADC[{012}] (deg/s)': DEGREE_RAD, 'gyroADC[{012}] (rad/s)': 1.0, '': 0.0}
 
-
-_BETAFLIGHT_FORMATS = tuple(
-    LogFormat('betaflight',
-              {'time': time, **_axes('accSmooth[{}]' + ending, names=_BY_NUMBER), **turns},
-              {'time': seconds, 'rate': rate}, units, tuple(turns.values()) or ('loopIteration',),
-              note='' if ending else
-              'Readings are counts, acc_1G of the header of the log to the g.')
-    for time, seconds in _BLACKBOX_TIMES.items() for ending, units in _BLACKBOX_UNITS.items()
-    for turns, rate in _BLACKBOX_RATES)
-
-# ------------------------------------------------------------------- ESP32 and Arduino
-# A sketch prints the names and units that its author chose, so that the table of names finds the
-# columns (none are listed here), and the readings at rest determine the unit.
-
-_ESP32 = LogFormat('esp32', {}, units='', plain=False)
-
-FORMATS: tuple[LogFormat, ...] = (*_PHYPHOX_FORMATS, _TOOLBOX, _LOGGER, *_MATLAB_FORMATS,
-                                  *_PX4_FORMATS, *_ARDUPILOT_FORMATS, *_BETAFLIGHT_FORMATS,
-                                  _ESP32)
+FORMATS: tuple[LogFormat, ...] = (
+    # phyphox: https://github.com/phyphox/phyphox-android
+    # The data sets of the app's own experiments, and of those made with "Add simple experiment".
+    # Both apps multiply by ±9.81 so that a phone with its screen up reads +z.
+    *(LogFormat('phyphox', {'time': 'Time (s)', 'reading': pattern}, {'time': 1.0},
+                without_gravity=(
+                    *names_of('Linear Acceleration {xyz} (m/s^2)'), 'Linear Acceleration.csv',
+                    'Linear Accelerometer.csv', 'Acceleration without g.csv'),
+                record="record 'Acceleration with g' (Raw sensors) in phyphox")
+      for pattern in ('Acceleration {xyz} (m/s^2)', '{xyz} (m/s^2)')),
+    # Physics Toolbox: https://www.vieyrasoftware.net
+    # The g-force meter has gravity; ax, ay, az beside it are the linear acceleration.
+    LogFormat('physics-toolbox', {'time': 'time', 'reading': 'gF{xyz}', 'rate': 'w{xyz}'},
+              {'rate': 1.0}, 'g', READING),
+    # Sensor Logger: https://github.com/tszheichoi/awesome-sensor-logger/blob/main/UNITS.md
+    # One file per sensor with the same header; the name of the file is the name of the sensor.
+    LogFormat('sensor-logger', {'time': 'seconds_elapsed', 'reading': '{xyz}'}, {'time': 1.0}, '',
+              ('time',), without_gravity=('Accelerometer.csv',),
+              other_sensors=('Gravity.csv', 'Gyroscope.csv', 'GyroscopeUncalibrated.csv',
+                             'Magnetometer.csv', 'MagnetometerUncalibrated.csv'),
+              record='use TotalAcceleration.csv (Android) or AccelerometerUncalibrated.csv of '
+                     'Sensor Logger',
+              note='Readings in g are those of an iPhone, with the opposite sign: a flat pose '
+                   'needs --frame win8.'),
+    # MATLAB Mobile:
+    # https://www.mathworks.com/help/matlabmobile/ug/logging-accelerometer-data.html
+    # The timetable Acceleration, written by writetimetable; or sensorlog_accel_*.csv of a phone's
+    # local log, where the time is in ms of Unix time.
+    *(LogFormat('matlab', {'time': time, 'reading': '{XYZ}'}, plain=False)
+      for time in ('Timestamp', 'Time')),
+    # PX4: https://docs.px4.io/main/en/msg_docs/
+    # One file for each topic, <log>_<topic>_<instance>.csv, written by ulog2csv of pyulog; the
+    # columns are the fields of SensorAccel, SensorCombined, VehicleImu and VehicleAcceleration.
+    *(LogFormat('px4', {'time': 'timestamp', **more, **PX4_FIELDS[message]},
+                {'time': MICRO, **scales}, marks=marks, note=f'{note}{_FRD}')
+      for message, more, scales, marks, note in (
+          ('sensor_accel', {'temperature': 'temperature'}, {}, ('device_id', 'error_count'), ''),
+          ('sensor_combined', {}, {}, (), 'Readings are corrected by the stored CAL_ACC '
+           'parameters; those of sensor_accel are not. '),
+          ('vehicle_imu', {}, {'reading': 1.0 / MICRO, 'rate': 1.0 / MICRO}, (), ''),
+          ('vehicle_acceleration', {}, {}, ('timestamp_sample',), ''))),
+    # ArduPilot: https://ardupilot.org/copter/docs/logmessages.html
+    # mavlogdump.py --format csv --types IMU (or ACC) writes the fields of the message after its
+    # own timestamp.
+    *(LogFormat('ardupilot', {'time': time, 'reading': 'Acc{XYZ}', **more, 'instance': 'I'},
+                {'time': MICRO}, marks=marks,
+                note=f'Readings are corrected by the stored INS_ACC parameters. {_FRD}')
+      for time, more, marks in (
+          ('TimeUS', {'rate': 'Gyr{XYZ}', 'temperature': 'T'}, ('GyrX',)),
+          ('SampleUS', {}, ('TimeUS',)),
+          ('TimeUS', {}, ()))),
+    # Betaflight: https://github.com/betaflight/blackbox-tools
+    # blackbox_decode, whose options --unit-frame-time, --unit-acceleration and --unit-rotation
+    # add the unit to the name, and the export of the Blackbox Explorer. Without units the readings
+    # are counts (acc_1G of the log's header per g), and the unit of the gyro is not in the file.
+    *(LogFormat('betaflight',
+                {'time': time, 'reading': 'accSmooth[{012}]' + ending,
+                 **({'rate': turns} if turns else {})},
+                {'time': seconds, 'rate': rate}, units,
+                names_of(turns) if turns else ('loopIteration',), note='' if ending else
+                'Readings are counts, acc_1G of the header of the log to the g.')
+      for time, seconds in _BLACKBOX_TIMES.items() for ending, units in _BLACKBOX_UNITS.items()
+      for turns, rate in _BLACKBOX_RATES.items()),
+    # ESP32 and Arduino: a sketch prints the names and units that its author chose, so that the
+    # table of names finds the columns, and the readings at rest determine the unit.
+    LogFormat('esp32', {}, units='', plain=False))
 
 NAMES: tuple[str, ...] = tuple(dict.fromkeys(each.name for each in FORMATS))
 """Names of the formats, as ``--format`` has them."""

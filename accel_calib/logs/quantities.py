@@ -25,8 +25,7 @@ from typing import Any, cast, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import Chosen, LogOptions, MOST, OF_POSES
-from .dialect import Cells, shown
+from .columns import Cells, Chosen, LogOptions, MOST, OF_POSES, shown
 from .names import DEGREE_RAD, meaning, READING, record_instead, unit_of, ZEROS
 from .times import Clock, clock_of
 from ..errors import InputError, saying
@@ -518,12 +517,13 @@ def _decide_context(made: Quantities, first: Cells) -> None:
             if unit not in ('', ours):
                 made.scales[key] = factor, ZEROS.get(unit, 0.0)
                 made.said.append(f'{source.name} in {unit} -> {ours}')
-            if (unit or key != 'temperature' or columns.maker is not None
-                    or (source.name == key and columns.layout.header)):
+            values = columns.numbers(first, key)
+            known = values[np.isfinite(values)]
+            if unit or key != 'temperature' or columns.maker is not None or not len(known):
                 continue
-            middle = float(np.median(columns.numbers(first, key)))
+            middle, own = float(np.median(known)), source.name == key and columns.layout.header
             if _LIKELY_TEMPERATURE_C[0] <= middle <= _LIKELY_TEMPERATURE_C[1]:
-                made.said.append(f'{source.name} in °C (assumed)')
+                made.said += [] if own else [f'{source.name} in °C (assumed)']
             else:
                 _leave_out(made, key, f'the temperature {source.name} has values of about '
                            f'{middle:.4g} in a unit that is not known, and is',

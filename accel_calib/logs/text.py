@@ -4,6 +4,11 @@
 """
 Numbers and texts of a text table of any dialect, block by block; lines of a port; our own tables.
 
+`find_layout` decides from the first lines of a file, its head, where the table begins and how its
+cells are parted. `csv.Sniffer` is not used: it needs many equal rows, and takes a letter, a
+decimal mark or a blank for the delimiter. The delimiter here is that of a header line with known
+names, or else the one whose cells are numbers in most lines.
+
 The rows are read once, in blocks, so the memory needed does not depend on the length of the file.
 `numpy.loadtxt` parses all numbers. A row is looked at on its own only if its block has a fault.
 
@@ -15,13 +20,14 @@ read, with values in JSON: ``# units: "m/s2"``, ``# sensor: "imu_link"`` and ``#
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 import csv
 from dataclasses import replace
 from functools import partial
 import io
-from itertools import chain, islice, pairwise
+from itertools import chain, islice, pairwise, product
 import json
 from pathlib import Path
 import re
@@ -30,13 +36,37 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import choose_columns, is_log_header, LogOptions
-from .dialect import Cells, Dialect, is_clock, is_number, layout_of, short
+from .columns import (
+    Cells, choose_columns, Dialect, EPOCH_S, is_clock, is_log_header, is_number, LABEL,
+    LABELLED_UNIT, LogOptions, MONITOR, RATES_HZ, short, TextLayout, UNREADABLE)
 from .quantities import decide_quantities
 from ..disk import write_atomically
 from ..errors import InputError
-from ..table import column_of, COLUMNS, Floats, Recording, Table
-from ..text import counted, one_line
+from ..table import ABOUT, Autopilot, column_of, COLUMNS, Floats, Recording, Table
+from ..text import counted, one_line, read_json
+from ..units import UNIT_NAMES
+
+DELIMITERS = (';', '\t', '|', ',', '')
+"""Delimiters in the order of preference; the empty one is any run of blanks."""
+
+_TRIED_LINES = 200
+"""Number of lines from which the delimiter and the decimal mark are found, and of the rows in
+`TextLayout.sample`."""
+
+_RATE = re.compile(
+    r'(?:rate|frequency|\bodr|\bfs|\bat)\b(?:[^\w\n]{0,12}(\d+(?:\.\d+)?)[ ,;\t]?(k?)Hz\b|'
+    r'\W{1,2}(k?)Hz\W{1,6}(\d+(?:\.\d+)?)\b)', re.ASCII | re.IGNORECASE)
+"""Rate of the samples in the lines before a table: ``Sample rate: 50.0Hz``, ``fs (Hz): 100``."""
+
+_MOTIONCAL = re.compile(r'Raw:(?:-?\d+,){8}-?\d+\s*')
+_MOTIONCAL_NAMES = ('accX', 'accY', 'accZ', *6 * ('',))
+"""Names of the counts that the sketches for MotionCal print; those of gyro and magnetometer have
+no unit."""
+
+_LIKE_NUMBER = re.compile(r'[-+]?(?:(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?|nan|inf)',
+                          re.ASCII | re.IGNORECASE)
+_DECIMAL = re.compile(r'[-+]?\d*([.,])\d+(?:[eE][-+]?\d+)?', re.ASCII)
+_EXAMPLE = 'such as time,ax,ay,az and one row for each pose or sample'
 
 ROWS = 65536
 """Number of lines in a block."""
@@ -57,7 +87,7 @@ _ONE_LABEL = re.compile(r'\s*([A-Za-z]\w*)(?:\s*[:=]\s*|\s+)[-+]?\d*\.?\d+(?:\s*
 
 def text_table(path: Path, options: LogOptions, raw: io.BufferedReader[Any], size: int
                ) -> TextTable:
-    """Return the text table of an open file of this size [bytes]; see `layout_of`."""
+    """Return the text table of an open file of this size [bytes]; see `find_layout`."""
     encoding = _encoding(raw.peek())
     text = io.TextIOWrapper(raw, encoding, errors='replace', newline=None)
     head, rows, characters = list[str](), iter(text), 0
@@ -109,6 +139,168 @@ def _encoding(head: bytes) -> str:
     return 'utf-8'
 
 
+def find_layout(path: Path, head: Sequence[str], options: LogOptions, encoding: str) -> TextLayout:
+    """
+    Return where a table begins, and how its cells are parted; raise InputError without a table.
+
+    `head` are the first lines, and the options may name columns.
+
+    """
+    bad = sum(len(UNREADABLE.findall(line)) for line in head)
+    if bad > 0.3 * sum(map(len, head)):
+        raise InputError(f'{path} is not a text file, expected a CSV table',
+                         'use a CSV table or a bag')
+    if all(line.isspace() or line[0] == '#' for line in head):
+        raise InputError(f'{path} is empty, expected a header line {_EXAMPLE}',
+                         'check that this is the intended file')
+    base = _base_of(head)
+    plain = [k for k, line in enumerate(head) if base.is_row(line)]
+    found = _find_names(head, base, options) or _find_numbers(head, base, plain)
+    if found is None:
+        raise InputError(f'{path} has no table of numbers in its first '
+                         f'{counted(len(head), "line")}, expected a header line {_EXAMPLE}',
+                         'check that this is the intended file')
+    dialect, header, at, first = found
+    cells = {k: dialect.cells(head[k]) for k in plain if k > at}
+    below = [k for k in cells if k >= first]
+    start = next((k for k in below if any(map(_LIKE_NUMBER.fullmatch, cells[k]))),
+                 below[0] if below else len(head))
+    values = [{float(cell) for cell in cells[k]} if all(map(is_number, cells[k])) else set()
+              for k in below[below.index(start):][:2]] if below else []
+    rate_hz = None
+    if not header and [*map(len, values)] == [1, 1] and len(cells[start]) >= len('xyz'):
+        (begun,), (rate,) = values  # Empatica writes the time and the rate into each column
+        if begun > EPOCH_S[0] and RATES_HZ[0] <= rate <= RATES_HZ[1]:
+            rate_hz, start = rate, below[2] if len(below) > 2 else start
+    passed = [short(head[k]) for k in plain if k < start and k != at]
+    skipped = f'skipped {counted(len(passed), "line")} before the table'
+    notes = [f'{skipped}{":" if len(passed) == 1 else ", the first is"} {each!r}'
+             for each in passed[:1]]
+    between = [tuple(cells[k]) for k in cells if k < start and at >= 0]
+    units_row = next((each for each in between if len(each) == len(header)), ())
+    rows = [cells[k] for k in cells if k >= start]
+    stated = {float(before or after) * (1000.0 if any(kilo) else 1.0) for line in head[:start]
+              for before, *kilo, after in _RATE.findall(line[:1000])}
+    if rate_hz is None and len(stated) == 1 and min(stated) > 0.0:
+        rate_hz = stated.pop()
+    decimal = {match[1] for row in rows[:_TRIED_LINES] for match in map(_DECIMAL.fullmatch, row)
+               if match}
+    return TextLayout(
+        path=path, dialect=dialect, decimal=min(decimal, default=''), header=header,
+        units_row=units_row, width=_width(header, rows), start=start, encoding=encoding,
+        about=_about(path, head), notes=tuple(notes),
+        sample=tuple(map(tuple, rows[:_TRIED_LINES])), rate_hz=rate_hz)
+
+
+_Found = tuple[Dialect, tuple[str, ...], int, int]
+"""Dialect, names, and the indices of the header line (or -1) and of the first line below it."""
+
+
+def _base_of(head: Sequence[str]) -> Dialect:
+    """Return what precedes each row, and which lines are none; the delimiter is any."""
+    filled = sum(not line.isspace() for line in head)
+    timed = sum(MONITOR.match(line) is not None for line in head)
+    raw = sum(_MOTIONCAL.fullmatch(line) is not None for line in head)
+    is_gcdc = any(line.startswith(';Headers,') for line in head)
+    return Dialect(',', timed > filled / 2, prefix='Raw:' if raw > filled / 3 else '',
+                   marks=(*Dialect.marks, ';') if is_gcdc else Dialect.marks)
+
+
+def _find_names(head: Sequence[str], base: Dialect, options: LogOptions) -> _Found | None:
+    """Return the names in the first line with known names."""
+    lettered = (k for k, line in enumerate(head) if any(map(str.isalpha, line[:1000])))
+    for k, delimiter in product(lettered, DELIMITERS):
+        dialect = replace(base, delimiter=delimiter)
+        cells = _names_in(head[k], dialect)
+        if cells and is_log_header(options, cells):
+            row = next((dialect.cells(line) for line in head[k + 1:] if base.is_row(line)), [])
+            if len(row) == len(cells) or (delimiter and not head[k].startswith(Dialect.marks)):
+                return dialect, tuple(cells), k, k + 1
+    return None
+
+
+def _names_in(line: str, dialect: Dialect) -> list[str]:
+    """
+    Return the cells of a header line; none if they are few or there are numbers.
+
+    A time of a monitor in front of them is the name of the times.
+
+    """
+    line = line.removeprefix(';Headers,')
+    cells = dialect.cells(line.lstrip('#/% ') if line.startswith(Dialect.marks) else line)
+    if dialect.monitor and cells and is_clock(cells[0]):
+        cells[0] = 'time'
+    return [] if len(cells) < 3 or any(map(_LIKE_NUMBER.fullmatch, cells)) else cells
+
+
+def _find_numbers(head: Sequence[str], base: Dialect, plain: Sequence[int]) -> _Found | None:
+    """
+    Return the dialect in which most `plain` lines are rows of numbers, and their names, if any.
+
+    If the table has too few columns, the first line has the names.
+
+    """
+    step = max(1, len(plain) // _TRIED_LINES)
+    tried = []
+    for labelled, delimiter in product((False, True), DELIMITERS):
+        dialect = replace(base, delimiter=delimiter, labelled=labelled)
+        widths = Counter(filter(any, (_row_width(dialect.cells(head[k])) for k in plain[::-step])))
+        for (width, others), count in widths.most_common(1):
+            tried.append((count, -others, width, dialect))
+    if not tried:
+        dialect = Dialect(',')
+        cells = [dialect.cells(head[k]) for k in plain]
+        numbers = [any(map(_LIKE_NUMBER.fullmatch, row)) for row in cells]
+        if not any(numbers):
+            return None
+        names = () if numbers[0] else tuple(cells[0])
+        return dialect, names, plain[0], plain[0] + len(names[:1])
+    _, _, width, dialect = max(tried, key=lambda each: each[:2])
+    first = next((k for k in plain if _row_width(dialect.cells(head[k]))[0] == width), plain[-1])
+    if dialect.prefix:
+        return dialect, _MOTIONCAL_NAMES, -1, first
+    if dialect.labelled:
+        line = LABELLED_UNIT.sub('', MONITOR.sub('', head[first]))
+        names = tuple(name.strip(' :=\t') for name in LABEL.findall(line))
+        return dialect, (*('time',) * dialect.monitor, *names), -1, first
+    before = ((k, _names_in(head[k], dialect)) for k in reversed(range(first)))
+    return next(((dialect, tuple(cells), k, first) for k, cells in before
+                 if len(cells) == width), (dialect, (), -1, first))
+
+
+def _row_width(cells: Sequence[str]) -> tuple[int, int]:
+    """Return the numbers of cells, and of those of text, of a row of numbers; 0 of others."""
+    numbers = sum(_LIKE_NUMBER.fullmatch(cell) is not None for cell in cells)
+    others = sum(bool(cell) and not is_clock(cell) for cell in cells) - numbers
+    return (len(cells), others) if numbers >= 3 and others <= numbers else (0, 0)
+
+
+def _width(header: Sequence[str], rows: Sequence[Sequence[str]]) -> int:
+    """Return the number of cells in a row; a delimiter at the end of each line may add one."""
+    if not header:
+        return Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
+    if rows and all(len(row) == len(header) + 1 and not row[-1] for row in rows):
+        return len(header) + 1
+    if rows and not header[-1] and all(len(row) == len(header) - 1 for row in rows):
+        return len(header) - 1
+    return len(header)
+
+
+def _about(path: Path, head: Sequence[str]) -> dict[str, Any]:
+    about = {}
+    for line in head:
+        name, colon, text = line[1:].partition(':')
+        if line[0] == '#' and colon and name.strip() in ABOUT:
+            with suppress(TypeError, ValueError):  # an ordinary comment
+                value = read_json(text)
+                about[name.strip()] = Autopilot(**value) if 'autopilot' in name else (
+                    '' if value is None else str(value))
+    if about.get('units', '') not in ('', *UNIT_NAMES):
+        raise InputError(f'{path} has the units {about["units"]!r}, expected one of '
+                         f'{", ".join(UNIT_NAMES)}', 'correct that line or remove it')
+    return about
+
+
 class TextTable:
     """
     A text table, read once, block by block; its columns are those that the options name.
@@ -121,7 +313,7 @@ class TextTable:
 
     def __init__(self, path: Path, head: Sequence[str], rest: Iterator[str], options: LogOptions,
                  encoding: str = 'utf-8', size: int = 0) -> None:
-        self.layout = layout_of(path, head, partial(is_log_header, options), encoding)
+        self.layout = find_layout(path, head, options, encoding)
         self.columns, self.size = choose_columns(self.layout, options), size
         self._numeric = (*self.columns.needed, *self.columns.context,
                          *self.columns.quantities.values())

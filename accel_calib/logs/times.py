@@ -10,15 +10,22 @@ A counter of the clock can start again. Rows with the newest first are turned ro
 are coarser than the samples, such as whole seconds, are spread: the k-th sample of one stamp is k
 periods later, and those of the first stamp, which may lack some, end with it.
 
+Dates are those of ISO 8601, ``2026-01-31T12:00:00.250Z``, with a blank for the T or slashes, and
+``31-Jan-2026`` and ``31.01.2026``. A date without a zone is taken as UTC.
+
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import datetime, timezone
+from functools import lru_cache
 import math
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .columns import Chosen, FRACTION, LogOptions, rates_beside
-from .dialect import Cells, CLOCK, EPOCH_S, RATES_HZ, seconds_of
+from .columns import Cells, Chosen, CLOCK, EPOCH_S, FRACTION, LogOptions, rates_beside, RATES_HZ
 from .names import bare_name, COUNTERS, READING, TICKS, unit_of, UNITS
 from ..errors import InputError
 from ..finding import Finding
@@ -26,6 +33,8 @@ from ..table import Floats
 
 _UNITS = dict(UNITS['time'].values())
 """Factors to seconds, by the name of the unit."""
+
+_DAYS = ('%Y-%m-%d', '%d-%b-%Y', '%d.%m.%Y', '%m-%d-%Y', '%d-%m-%Y')
 
 _TICK = 'ticks of 100 µs'
 _DAY_S = 86_400.0
@@ -105,7 +114,7 @@ class Clock:
         """Return the times of a block as they are stated [s]."""
         columns = self.columns
         if columns.dates:
-            return seconds_of(cells.texts[columns.dates[0]], columns.layout.path, cells.row)
+            return _seconds_of(cells.texts[columns.dates[0]], columns.layout.path, cells.row)
         seconds = columns.numbers(cells, 'time')[:, 0] * self.scale
         if FRACTION in columns.sources:
             return seconds + 1e-9 * columns.numbers(cells, FRACTION)[:, 0]
@@ -253,3 +262,35 @@ def _step_of(stamps: Floats) -> float:
         usual = steps[(steps >= 0.0) & (steps <= _GAP * middle)]
         return float(np.mean(usual)) if len(usual) else middle
     return float(np.maximum(steps, 0.0).sum()) / len(steps)
+
+
+def _seconds_of(texts: NDArray[np.object_], path: Path, rows: NDArray[np.int64]) -> Floats:
+    """Return the seconds of dates since 1970, or of times since midnight; else InputError."""
+    seconds = np.zeros(len(texts))
+    for k, text in enumerate(texts):
+        day, match = None, CLOCK.fullmatch(text)
+        if match is not None:
+            date, hours, minute, second, digits, half, zone = match.groups()
+            day, hour = _day(date) if date else 0.0, int(hours)
+            if half and 1 <= hour <= 12:
+                hour = hour % 12 + 12 * (half[0] in 'Pp')
+        if day is None or not (hour < 24 and int(minute) < 60 and int(second or 0) <= 60):
+            raise InputError(f'{path}: row {rows[k]} has the time {text[:40]!r}, expected one '
+                             'such as 2026-01-31T12:00:00.250', 'correct the row or remove it')
+        fraction, offset = float(f'0.{digits or 0}'), 0.0
+        if zone not in (None, 'Z', 'UTC'):
+            size = int(zone[1:3]) * 3600.0 + int(zone[3:].lstrip(':') or 0) * 60.0
+            offset = -size if zone[0] == '-' else size
+        whole = day + hour * 3600.0 + int(minute) * 60.0 + int(second or 0)
+        seconds[k] = whole - offset + fraction
+    return seconds
+
+
+@lru_cache(maxsize=64)
+def _day(date: str) -> float | None:
+    """Return the seconds from 1970 to a day, or None if there is no such day."""
+    for form in _DAYS:
+        with suppress(ValueError):  # It has another form.
+            day = datetime.strptime(date.replace('/', '-'), form)
+            return day.replace(tzinfo=timezone.utc).timestamp()
+    return None

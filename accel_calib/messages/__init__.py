@@ -4,12 +4,14 @@
 """
 Correction of sensor_msgs/Imu messages, from bags and from topics.
 
-`correction` corrects many serialized messages or single ones, these by `one_reading`, and `bags`
-writes corrected copies of bags.
+`correction` corrects many serialized messages or single ones, and `bags` writes corrected copies
+of bags.
 
 """
 
 from .bags import correct_bag
-from .correction import corrected, motion_of, output_frame, output_scale, Rewriter
+from .correction import (
+    corrected, Known, motion_of, OneReading, output_frame, output_scale, Rewriter, Triple)
 
-__all__ = ['Rewriter', 'correct_bag', 'corrected', 'motion_of', 'output_frame', 'output_scale']
+__all__ = ['Known', 'OneReading', 'Rewriter', 'Triple', 'correct_bag', 'corrected', 'motion_of',
+           'output_frame', 'output_scale']

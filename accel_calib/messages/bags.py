@@ -165,8 +165,7 @@ def _copy(imus: _Imus, parts: Iterator[Any], folder: Path, out: Path, progress: 
     """Copy all messages, correct those of the Imu topic, and return the notes about the bag."""
     target = folder / (out.stem if out.suffix in ('.mcap', '.db3') else out.name)
     imu, written, notes = {*imus.known['imu']}, 0, list[str]()
-    writer = _writer(imus, target, out.suffix)
-    with writer:
+    with _writer(imus, target, out.suffix) as writer:
         with BAG.file(imus.path).refused():
             outputs = _added(imus, writer)
         for block in parts:
@@ -183,23 +182,18 @@ def _copy(imus: _Imus, parts: Iterator[Any], folder: Path, out: Path, progress: 
                 writer.write(outputs[connection], stamp, changed.get(k, raws[k]))
             written += len(raws)
             progress(imus.done, imus.known['count'])
-    _check_copy(imus.path, target, written)
-    (target if target.name == out.name else next(target.glob(f'*{out.suffix}'))).rename(out)
-    return notes
-
-
-def _check_copy(path: Path, target: Path, written: int) -> None:
-    """Check that a copy can be read back, and that its files hold all messages."""
-    try:
+    try:  # it can be read back, and its files hold all messages
         with BAG.file(target).refused(), open_bag(target) as copy:
-            found = copy.stored
+            stored = copy.stored
     except InputError as err:
         what = err.message.removeprefix(f'{target} ')
-        raise InputError(f'{path} cannot be copied: the copy {what}', 'use a bag whose topics '
-                         'have valid names, types and formats') from err
-    if found != written:
-        raise InputError(f'{path}: the copy holds {found} of {written} messages, expected '
+        raise InputError(f'{imus.path} cannot be copied: the copy {what}', 'use a bag whose '
+                         'topics have valid names, types and formats') from err
+    if stored != written:
+        raise InputError(f'{imus.path}: the copy holds {stored} of {written} messages, expected '
                          'all', 'check the disk, and try again')
+    (target if target.name == out.name else next(target.glob(f'*{out.suffix}'))).rename(out)
+    return notes
 
 
 def _writer(imus: _Imus, target: Path, suffix: str) -> Any:

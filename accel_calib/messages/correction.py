@@ -25,25 +25,31 @@ The conventions for covariances are kept: a first element of -1 means no data, a
 unknown. A covariance that is not finite becomes unknown. The covariance of the calibration is
 added to a known covariance of the acceleration.
 
-**Single messages.** `Rewriter` has the result of `corrected`, but computes with Python floats
-(`one_reading`). Covariances rarely change from message to message, so that each is transformed
-only once.
+**Single messages.** `Rewriter` has the result of `corrected`, but computes with Python floats:
+each call of numpy takes about 1 µs, and `Calibration.correct` makes dozens. `OneReading` sums the
+terms of the catalogue (`accel_calib.effects`). With the context fixed, the affine terms sum to
+an offset and a gain; only the bending terms are iterated, as in `accel_calib.effects.model`.
+Covariances rarely change from message to message, so that each is transformed only once.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property
+from itertools import repeat
 import math
+from operator import add
 import struct
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .one_reading import AtReading, OneReading, Triple
 from ..calibration import Calibration, SampleNoise
-from ..effects import context_of_samples, thermal_stream, ThermalStream
+from ..effects import (
+    AFFINE, check_context, context_of_samples, CONVERGED_G, Effect, FORCE, LARGEST_FORCE_G,
+    LARGEST_ITERATIONS, MONOMIALS, ONE, own_slope, thermal_stream, ThermalStream, too_large)
 from ..errors import InputError
 from ..geometry import quaternion_of
 from ..logs import (
@@ -68,7 +74,7 @@ def corrected(calibration: Calibration, doubles: Floats, context: Mapping[str, N
     calibration : Calibration
         The calibration, in the unit of the messages.
     doubles : (n, 37) array
-        One row per message; see `accel_calib.logs.serialized`.
+        One row per message; see `accel_calib.logs.bag`.
     context : mapping of str to array, optional
         Columns that the effects need, n rows each.
     scale : float
@@ -84,7 +90,7 @@ def corrected(calibration: Calibration, doubles: Floats, context: Mapping[str, N
         result[:, ANGULAR_VELOCITY] = doubles[:, ANGULAR_VELOCITY] @ rotation
         present = doubles[:, ORIENTATION_COVARIANCE.start] != -1.0
         x, y, z, w = doubles[present, ORIENTATION].T
-        result[present, ORIENTATION] = np.array(_product(x, y, z, w, *quaternion_of(rotation))).T
+        result[present, ORIENTATION] = np.array(_compose(x, y, z, w, *quaternion_of(rotation))).T
     turn = rotation.T if calibration.is_levelled else np.eye(3)
     for part, matrix in ((ANGULAR_VELOCITY_COVARIANCE, turn), (ORIENTATION_COVARIANCE, turn), (
             ACCELERATION_COVARIANCE, scale * rotation.T @ np.linalg.inv(calibration.gain))):
@@ -115,18 +121,272 @@ def _transformed(matrix: Floats, covariance: Floats) -> tuple[Floats, NDArray[np
     return found, known
 
 
-def _product(x: Any, y: Any, z: Any, w: Any, p: float, q: float, r: float, s: float
+def _compose(x: Any, y: Any, z: Any, w: Any, p: float, q: float, r: float, s: float
              ) -> tuple[Any, Any, Any, Any]:
     """Return the product of two quaternions (x, y, z, w); the first can have arrays."""
     return (w * p + x * s + y * r - z * q, w * q - x * r + y * s + z * p,
             w * r + x * q - y * p + z * s, w * s - x * p - y * q - z * r)
 
 
+# ---------------------------------------------------------------------------- one reading
+
+Triple = tuple[float, float, float]
+Matrix = Sequence[float]
+"""Nine numbers, row by row."""
+
+Known = Mapping[str, Any]
+"""Context of one reading: floats and triples, with the keys of `accel_calib.effects.Context`."""
+
+_Term = tuple[int, int, float]
+"""Axis, monomial, and weight times value of a term of an effect."""
+
+_Bend = tuple[int, float, Callable[[float, float, float], float],
+              Callable[[float, float, float], Triple]]
+"""Axis, coefficient, value and gradient of a bending term with its context fixed."""
+
+_SLOW = 3
+"""Iterations after which the slope is computed at the present force."""
+
+
+class OneReading:
+    """
+    A calibration prepared for the correction of single readings; `scale` is on the force.
+
+    `monomials` are the indices of those of the model; the affine monomials are first.
+
+    """
+
+    def __init__(self, calibration: Calibration, scale: float = 1.0) -> None:
+        model = calibration.model
+        self._calibration = calibration
+        unit = calibration.force_per_g * scale
+        self.turn: Matrix = (model.rotation.T * unit).ravel().tolist()
+        self.back: Matrix = (model.rotation / unit).ravel().tolist()
+        self.per_g = calibration.units.per_g
+        self._fixed = [0.0] * 12
+        self._bends: list[_Bend] = []
+        self._varying: list[tuple[Effect, list[float], list[_Term]]] = []
+        self.of_force: list[tuple[Effect, list[float], list[_Term]]] = []
+        for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
+            size, shape = effect.split(values)
+            terms = [(each.axis, each.monomial, each.weight * float(size[each.parameter]))
+                     for each in effect.terms]
+            if effect.factor is not None:
+                kept = self.of_force if effect.of_force else self._varying
+                kept.append((effect, shape.tolist(), terms))
+            else:
+                self._add(terms, repeat(1.0), self._fixed, self._bends)
+        self._varying.sort(key=lambda each: each[0].scales)
+        used = model.terms.monomials
+        self.monomials = (*range(AFFINE), *(index for index in used if index >= AFFINE))
+        self._fixed_at = (None if self._varying or self.of_force
+                          else AtReading(self, self._fixed, self._bends, {}))
+
+    def _add(self, terms: list[_Term], factors: Iterable[float], affine: list[float],
+             bends: list[_Bend]) -> None:
+        """Add terms to V and W - I, row by row, and to the bending terms."""
+        for (axis, monomial, size), factor in zip(terms, factors):
+            size *= factor
+            if monomial == ONE:
+                affine[axis] += size
+            elif monomial < AFFINE:
+                affine[3 + 3 * axis + monomial - FORCE] += size
+            else:
+                value, gradient = MONOMIALS[monomial]
+                bends.append((axis, size, value, gradient))
+
+    def at(self, known: Known) -> AtReading:
+        """Return the calibration at a context; a quantity that is missing is an InputError."""
+        if self._fixed_at is not None:
+            return self._fixed_at
+        check_context(self._calibration.model, known)
+        ranges = self._calibration.ranges
+        if ranges:  # effects are not extrapolated
+            known = {**known, **{key: min(max(known[key], low), high)
+                                 for key, (low, high) in ranges.items() if key in known}}
+        affine, bends = list(self._fixed), list(self._bends)
+        for effect, shape, terms in self._varying:
+            factors = _factors(effect, known, shape, terms)
+            if effect.scales:  # all other gains are there
+                affine[3:] = [part * (1.0 + terms[0][2] * factors[0]) for part in affine[3:]]
+            self._add(terms, factors, affine, bends)
+        return AtReading(self, affine, bends, known)
+
+    @cached_property
+    def _spread_rows(self) -> tuple[Floats, Floats]:
+        """Return the (m, t) monomial of each row of the basis, and its (t, 3 p) part of a root."""
+        model, covariance = self._calibration.model, self._calibration.covariance
+        size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))  # constants have other units
+        variances, axes = np.linalg.eigh(covariance / size / size[:, np.newaxis])
+        root = model.rows.to_value.T @ (axes * size[:, np.newaxis] * np.sqrt(
+            np.maximum(variances, 0.0)))
+        of_axis = np.eye(3)[model.rows.axis][:, :, np.newaxis]
+        monomials = np.take(model.terms.monomials, model.rows.place)
+        return (np.equal.outer(self.monomials, monomials).astype(float),
+                (of_axis * root[:, np.newaxis]).reshape(len(root), -1))
+
+    def spread_basis(self, known: Known, u: Triple) -> Floats:
+        """Return the (m, 3 p) basis of each monomial times a root of the covariance."""
+        model = self._calibration.model
+        row = {key: np.asarray(value, float)[np.newaxis] for key, value in known.items()}
+        basis = model.basis_of(model.terms.weight[:, np.newaxis], row, np.array([u]))
+        which, rows = self._spread_rows
+        return np.asarray((which * basis.terms[:, 0]) @ rows)
+
+
+def _factors(effect: Effect, known: Known, shape: Any, terms: Sequence[_Term]) -> list[float]:
+    """Return the factor of an effect on each of its terms; 0 where its context is NaN."""
+    factor: Any = effect.factor(known, shape) if effect.factor is not None else 1.0
+    if isinstance(factor, np.ndarray):
+        return np.broadcast_to(np.nan_to_num(factor), len(terms)).tolist()
+    return [0.0 if factor != factor else float(factor)] * len(terms)
+
+
+class AtReading:
+    """
+    A calibration with its context fixed; `OneReading.at` returns it.
+
+    `correct` is the function reading x, y, z -> specific force in the levelled frame, times the
+    scale. It raises InputError if the effects cannot be corrected.
+
+    """
+
+    def __init__(self, owner: OneReading, affine: Sequence[float], bends: list[_Bend],
+                 known: Known) -> None:
+        self._owner, self._bends, self._known = owner, bends, known
+        a, b, c, d, e, f, g, h, i = affine[3:]
+        self._gain = (a + 1.0, b, c, d, e + 1.0, f, g, h, i + 1.0)
+        inverse = _inverse(self._gain)
+        offset = _times(inverse, *affine[:3])
+        if bends or owner.of_force:
+            self.correct = self._solving(inverse, offset)
+        else:
+            matrix = _matmul(owner.turn, inverse)
+            self.correct = _affine([part / owner.per_g for part in matrix],
+                                   _times(owner.turn, *offset))
+
+    def _solving(self, inverse: Matrix, offset: Triple) -> Callable[[float, float, float], Triple]:
+        """
+        Return the function that solves for u, and rotates it.
+
+        The method is Newton's, with a slope that is computed again only if convergence is slow.
+        `model.AtContext.force` solves the same equation for many readings.
+
+        """
+        undone = _affine([part / self._owner.per_g for part in inverse], offset)
+        turn, bend, near, far = self._owner.turn, self._bend, CONVERGED_G, LARGEST_FORCE_G
+        toward: Matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+        def correct(x: float, y: float, z: float) -> Triple:
+            nonlocal toward
+            p, q, r = left, mid, right = undone(x, y, z)
+            last = near
+            for count in range(LARGEST_ITERATIONS):
+                j, k, m = _times(inverse, *bend(p, q, r))
+                j, k, m = p + j - left, q + k - mid, r + m - right
+                if count == _SLOW:
+                    toward = _matmul(_inverse(self._slope_at((p, q, r))), self._gain)
+                j, k, m = _times(toward, j, k, m)
+                p, q, r = p - j, q - k, r - m
+                if not (-far < p < far and -far < q < far and -far < r < far):
+                    break
+                step = max(abs(j), abs(k), abs(m))
+                if step * step < near * last:  # the next step would be smaller than that
+                    return _times(turn, p, q, r)
+                last = step
+            raise too_large()
+
+        return correct
+
+    def _bend(self, x: float, y: float, z: float) -> list[float]:
+        """Return what the bending terms add to a reading at a force [g]."""
+        added = [0.0, 0.0, 0.0]
+        for axis, size, value, _ in self._bends:
+            added[axis] += size * value(x, y, z)
+        for effect, shape, terms in self._owner.of_force:
+            factors = _factors(effect, {**self._known, 'force': (x, y, z)}, shape, terms)
+            for (axis, _, size), factor in zip(terms, factors):
+                added[axis] += size * factor
+        return added
+
+    def _slope_at(self, u: Triple) -> Matrix:
+        """Return the slope of the reading at a force."""
+        if self._owner.of_force:
+            bent = own_slope(lambda at: np.array([self._bend(*at[0])]), np.array([u]))
+            return [*map(add, self._gain, bent.ravel().tolist())]
+        slope = list(self._gain)
+        for axis, size, _, gradient in self._bends:
+            for at, part in enumerate(gradient(*u), 3 * axis):
+                slope[at] += size * float(part)
+        return slope
+
+    def with_spread(self, force: Triple, own: Sequence[float]) -> Sequence[float]:
+        """
+        Return the covariance of a corrected force, with the uncertainty of the calibration.
+
+        `own` is the covariance of the force from the noise of the reading, row by row.
+
+        """
+        if self._bends or self._owner.of_force:
+            u = _times(self._owner.back, *force)
+            monomials = [MONOMIALS[index].value(*u) for index in self._owner.monomials]
+            to_force = np.reshape(_matmul(self._owner.turn, _inverse(self._slope_at(u))), (3, 3))
+            basis = (self._owner.spread_basis(self._known, u) if self._owner.of_force
+                     else self._basis)
+            moved = to_force @ np.dot(monomials, basis).reshape(3, -1)
+        else:
+            moved = np.dot((1.0, *force), self._affine_basis).reshape(3, -1)
+        return [*map(add, own, (moved @ moved.T).ravel().tolist())]
+
+    @cached_property
+    def _affine_basis(self) -> Floats:
+        """Return the (4, 3 p) basis times 1 and the force, for a model without bending terms."""
+        basis = self._basis.reshape(AFFINE, 3, -1)
+        moved = np.reshape(_matmul(self._owner.turn, _inverse(self._gain)), (3, 3)) @ basis
+        moved[1:] = np.einsum('ij,ikp->jkp', np.reshape(self._owner.back, (3, 3)), moved[1:])
+        return moved.reshape(AFFINE, -1)
+
+    @cached_property
+    def _basis(self) -> Floats:
+        return self._owner.spread_basis(self._known, (0.0, 0.0, 0.0))
+
+
+def _affine(matrix: Matrix, less: Triple) -> Callable[[float, float, float], Triple]:
+    """Return the function v -> matrix @ v - less."""
+    a, b, c, d, e, f, g, h, i = matrix
+    p, q, r = less
+    return lambda x, y, z: (
+        a * x + b * y + c * z - p, d * x + e * y + f * z - q, g * x + h * y + i * z - r)
+
+
+def _times(matrix: Matrix, x: float, y: float, z: float) -> Triple:
+    a, b, c, d, e, f, g, h, i = matrix
+    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
+
+
+def _matmul(one: Matrix, other: Matrix) -> Matrix:
+    columns = [_times(one, *other[k::3]) for k in range(3)]
+    return [part for row in zip(*columns) for part in row]
+
+
+def _inverse(matrix: Matrix) -> Matrix:
+    """Return the inverse of a gain, which the gate has found not to be singular."""
+    a, b, c, d, e, f, g, h, i = matrix
+    p, q, r = e * i - f * h, f * g - d * i, d * h - e * g
+    size = a * p + b * q + c * r
+    return (p / size, (c * h - b * i) / size, (b * f - c * e) / size,
+            q / size, (a * i - c * g) / size, (c * d - a * f) / size,
+            r / size, (b * g - a * h) / size, (a * e - b * d) / size)
+
+
+# --------------------------------------------------------------------------- one message
+
 LARGEST_G = 100.0
 """Larger corrected forces are not published [g]. The range of common accelerometers is 16 to 40 g;
 shock sensors cannot be calibrated by gravity."""
 
-_FORCE, _FRONT, _WHOLE = (struct.Struct(each) for each in ('<12d', '<4d72s3d72s', '<4d72s3d72s3d'))
+_FORCE, _FRONT, _WHOLE = (
+    struct.Struct(each) for each in ('<12d', '<4d72s3d72s', '<4d72s3d72s3d72s'))
 _ABSENT = struct.pack('<d', -1.0)
 _UNKNOWN = bytes(72)
 _NONE: Triple = (0.0, 0.0, 0.0)
@@ -189,8 +449,6 @@ class Rewriter:
         self._around: list[float | None] = []
         self._largest = LARGEST_G * gravity
         self._given, self.layout = layout, layout_with(frame_id)
-        self._force, self._force_spread, self._rate, self._rate_spread = map(layout.place, (
-            ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE))
         self._renamed = self.layout.name != layout.name
         self._name = self.layout.name + bytes(self.layout.begin - self.layout.name_end)
         stated = [np.full(3, np.nan)] * 2 if noise is None else [noise.force, noise.rate]
@@ -207,13 +465,12 @@ class Rewriter:
         is not plausible are an InputError.
 
         """
-        given = _WHOLE.unpack_from(data, self._given.begin)
-        x, y, z = given[-3:]
+        *front, x, y, z, covariance = _WHOLE.unpack_from(data, self._given.begin)
         if not math.isfinite(x + y + z):
             return None
         at = self._at
         if at is None or (self._needs and (self._per_message or context is not self._context)):
-            at = self._at_context(data, context)
+            at = self._at_context(data, front, context)
         force = at.correct(x, y, z)
         largest = self._largest
         a, b, c = force
@@ -221,17 +478,17 @@ class Rewriter:
             words = ', '.join(f'{part:.3g}' for part in force)
             raise InputError(f'the corrected acceleration is ({words}) m/s², expected less than '
                              f'{LARGEST_G:.0f} g', 'check the calibration and the driver')
-        covariance, seen = data[self._force_spread:], self._seen_force
+        seen = self._seen_force
         if covariance != seen.given:
             seen = self._seen_force = _seen(self._inverse, covariance, self._fill_force)
-        before = self._before(data, given)
+        before = self._before(data, front)
         if seen.turned is None:
             return before + THREE.pack(a, b, c) + seen.new
         return before + _FORCE.pack(a, b, c, *at.with_spread(force, seen.turned))
 
-    def _before(self, data: bytes, given: tuple[Any, ...]) -> bytes:
-        """Return the message before the acceleration."""
-        attitude, orientation_spread, rate, rate_spread = given[:4], given[4], given[5:8], given[8]
+    def _before(self, data: bytes, front: Sequence[Any]) -> bytes:
+        """Return the message before the acceleration; `front` are its fields there."""
+        x, y, z, w, orientation_spread, p, q, r, rate_spread = front
         if rate_spread != self._seen_rate.given:
             self._seen_rate = _seen(self._turn, rate_spread, self._fill_rate)
         if orientation_spread != self._seen_orientation.given:
@@ -244,27 +501,24 @@ class Rewriter:
                 else data[:begin])
         if not (self._turns or u or v or t or new_rate != rate_spread
                 or new_orientation != orientation_spread):
-            return head + data[begin:self._force]
-        p, q, r = rate
+            return head + data[begin:begin + _FRONT.size]
         if has_rate:
-            p, q, r = rate = p - u, q - v, r - t
+            p, q, r = p - u, q - v, r - t
         if self._turns:
             if has_orientation:
-                x, y, z, w = attitude
-                attitude = _product(x, y, z, w, *self._quaternion)
-            d, e, f, g, h, i, j, k, m = self._turn
-            rate = d * p + e * q + f * r, g * p + h * q + i * r, j * p + k * q + m * r
-        return head + _FRONT.pack(*attitude, new_orientation, *rate, new_rate)
+                x, y, z, w = _compose(x, y, z, w, *self._quaternion)
+            p, q, r = _times(self._turn, p, q, r)
+        return head + _FRONT.pack(x, y, z, w, new_orientation, p, q, r, new_rate)
 
-    def _at_context(self, data: bytes, context: Mapping[str, float]) -> AtReading:
+    def _at_context(self, data: bytes, front: Sequence[Any], context: Mapping[str, float]
+                    ) -> AtReading:
         """Return the calibration at the context of a message, and cache it."""
         around = [context.get(key) for key in self._needs]
         same, self._context, self._around = around == self._around, context, around
         if self._at is not None and same and not self._per_message:
             return self._at
         seconds, nanoseconds = STAMP.unpack_from(data, STAMP_AT)
-        rate: Triple = THREE.unpack_from(data, self._rate)
-        absent = data[self._rate_spread:self._rate_spread + 8] == _ABSENT
+        rate, absent = tuple(front[5:8]), front[8][:8] == _ABSENT
         time = seconds + nanoseconds * 1e-9
         known: dict[str, Any] = {
             **self._neutral, **context, 'time': time, 'std': _NONE, 'previous': _NONE,

@@ -4,15 +4,14 @@
 """
 Noise figures from a long rest, by Allan deviation.
 
-`curve` finds the longest rest, and computes its Allan variances and the covariance of their
-estimates. `components` fits white noise, bias instability and random walk to them. `figures`
-returns these by axis, with their limits in words, and as JSON.
+`figures` finds the longest rest, and returns its figures by axis, with their limits in words, and
+as JSON. `allan` computes Allan variances and the covariance of their estimates, and fits white
+noise, bias instability and random walk to them.
 
 """
 
-from .components import AxisNoise, FIGURES, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
-from .curve import check_allantools, whole
-from .figures import duration, noise_of, to_json
+from .allan import AxisNoise, check_allantools, FIGURES, Kind, NoiseFigures
+from .figures import duration, noise_of, shown_unit, to_json, TYPICAL, whole, WORDS
 
 __all__ = ['FIGURES', 'TYPICAL', 'WORDS', 'AxisNoise', 'Kind', 'NoiseFigures', 'check_allantools',
            'duration', 'noise_of', 'shown_unit', 'to_json', 'whole']

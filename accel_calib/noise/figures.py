@@ -2,7 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Noise figures of a sensor from a long rest.
+Noise figures of a sensor from the longest rest of a recording.
+
+**Rest.** The detector of `accel_calib.stillness` finds the rests, which end at an interruption of
+the stamps. A few missing samples are replaced by the sample before, because a recording that loses
+one sample in a thousand would otherwise have no long rest. Stamps with jitter are not used one by
+one: samples come from a regular clock, and their order is right.
 
 Accelerometers and gyros have three figures by axis: the white-noise density N (velocity or angle
 random walk), the bias instability B and the random walk K (of the acceleration, or of the rate).
@@ -16,20 +21,57 @@ curve rises over two octaves. Common parts need hours.
 
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
 import numpy as np
 import scipy
 
-from .components import (
-    AxisNoise, COMPONENTS, FIGURES, fit_components, Kind, KINDS, LEVEL, NoiseFigures, shown_unit)
-from .curve import (
-    allan_variances, check_allantools, coarse_step, FLAT, longest_rest, LongRest, octaves, shares,
-    Spread, spread_of)
-from ..table import Floats, Recording
+from .allan import (
+    allan_variances, AxisNoise, check_allantools, COMPONENTS, FIGURES, fit_components, FLAT, Kind,
+    KINDS, LEVEL, NoiseFigures, octaves, shares, Spread, spread_of)
+from ..errors import InputError
+from ..stillness import CaptureSettings, StillDetector
+from ..table import concatenated, Floats, numbered, Recording
+from ..text import counted
 from ..units import is_native, STANDARD_GRAVITY, Units
+
+WORDS = {'quantisation': 'quantisation noise', 'noise_density': 'white noise',
+         'bias_instability': 'bias instability', 'random_walk': 'random walk'}
+
+_MICRO_G = 1e6 / STANDARD_GRAVITY
+
+_MILLI_DEGREES = float(np.degrees(1e3))
+
+_ONE_SIDED = 2.0 ** 0.5
+"""Data sheets state the density for positive frequencies alone, which is √2 N."""
+
+TYPICAL: Mapping[tuple[str, str, str], tuple[float, float]] = {
+    ('accelerometer', 'noise_density', 'm/s²'): (
+        70.0 / _MICRO_G / _ONE_SIDED, 400.0 / _MICRO_G / _ONE_SIDED),
+    ('gyroscope', 'noise_density', 'rad/s'): (
+        2.8 / _MILLI_DEGREES / _ONE_SIDED, 5.0 / _MILLI_DEGREES / _ONE_SIDED)}
+"""
+N of a quiet and of a noisy common part, by sensor, figure and unit.
+
+From the data sheets of ICM-42688-P (TDK DS-000347, tables 1 and 2) and MPU-6050 (InvenSense
+PS-MPU-6000A-00, revision 3.4, sections 6.1 and 6.2). They do not state the other figures.
+
+"""
+
+_SHOWN = {
+    ('accelerometer', 'noise_density'): ('µg/√Hz', _MICRO_G),
+    ('accelerometer', 'bias_instability'): ('µg', _MICRO_G),
+    ('accelerometer', 'random_walk'): ('µg/s/√Hz', _MICRO_G),
+    ('gyroscope', 'noise_density'): ('m°/s/√Hz', _MILLI_DEGREES),
+    ('gyroscope', 'bias_instability'): ('°/h', float(np.degrees(3600.0))),
+    ('gyroscope', 'random_walk'): ('m°/s²/√Hz', _MILLI_DEGREES),
+}
+
+_NATIVE = {'noise_density': 'native/√Hz', 'bias_instability': 'native',
+           'random_walk': 'native/s/√Hz'}
 
 _INSTABILITY_S = 40.0 * 60.0
 """Shortest rest that shows the bias instability of common parts [s]: 100 times τ = 24 s."""
@@ -43,9 +85,6 @@ _WALK_S = 5.0 * 3600.0
 _TOO_LONG = 100.0 * 3600.0
 """Longest rest that is worth a figure [s]."""
 
-_DISTURBED = ('the curve at long τ has another form (temperature or disturbance); record at a '
-              'constant temperature')
-
 _WHITE_SAMPLES = 500
 
 _DEPARTS = 0.1
@@ -58,6 +97,193 @@ _WARM = 1.0
 """Change of the temperature that is worth a warning [°C]."""
 
 _MINUTE, _HOUR = 60.0, 3600.0
+
+LEAST_SAMPLES = 64
+"""Smallest number of samples of a rest: five octaves of τ."""
+
+_LONG = 1.5
+"""Interval between stamps that indicates a missing sample, in units of the usual interval."""
+
+_INTERRUPTED = 10
+"""Number of missing samples in a row that interrupts a rest."""
+
+_MOST_MISSING = 0.02
+"""Largest part of missing samples; with more long intervals, the stamps have jitter."""
+
+_UNEVEN = 0.1
+"""Standard deviation of the intervals that is worth a note, in units of the mean interval."""
+
+_COARSE = 1.0
+"""Noise in units of the step of the output below which rounding changes the noise."""
+
+_BLOCK_S = 1.0
+"""Length of the averages in which a coarse record is searched for a rest [s]."""
+
+_NEAR_STEP = 2.0
+"""Noise in units of the step below which steps can look like motions."""
+
+_AROUND, _MOVED = 5, 3.0
+"""Number of blocks before and after a motion, and its least size in steps."""
+
+_DISTURBED = 12.0
+"""Variance of the samples of a disturbed block, in units of the usual one or of a step."""
+
+
+@dataclass(frozen=True)
+class LongRest:
+    """
+    The longest rest of a recording.
+
+    `start` is the first stamp [s], and `rate` the samples per second [Hz]. `values` (c, n) are
+    readings [g], and angular rates [rad/s] if the recording has them; `temperature` (n,) is in °C.
+    `notes` state what is not regular.
+
+    """
+
+    start: float
+    rate: float
+    values: Floats
+    temperature: Floats | None
+    notes: tuple[str, ...]
+
+    @property
+    def samples(self) -> int:
+        """Return the number of samples."""
+        return int(self.values.shape[1])
+
+    @property
+    def seconds(self) -> float:
+        """Duration [s]."""
+        return self.samples / self.rate
+
+
+def longest_rest(recording: Recording, units: Units) -> LongRest:
+    """Return the longest rest without an interruption; raise InputError if it is too short."""
+    best, seconds = recording.take(slice(0)), 0.0
+    for samples, seen in ((recording, recording), *_averaged(recording)):
+        detector = StillDetector(CaptureSettings(), units, keep=None)
+        detector.add_recording(seen)
+        detector.close()
+        for dwell in sorted(detector.dwells(), key=lambda dwell: dwell.start - dwell.end):
+            if dwell.end - dwell.start <= seconds:
+                break
+            for part in _uninterrupted(samples['time'], dwell.start, dwell.end):
+                length = float(samples['time'][part[1] - 1] - samples['time'][part[0]])
+                if length > seconds:
+                    best, seconds = samples.take(slice(*part)), length
+    count, time = len(best), recording['time']
+    if count < LEAST_SAMPLES:
+        recorded = float(np.ptp(time)) if len(time) else 0.0
+        found = counted(count, 'sample') if count else 'no sample'
+        raise InputError(f'the longest rest in {recorded:.3g} s has {found}, expected at least '
+                         f'{LEAST_SAMPLES}', 'record the sensor for some minutes to hours while '
+                         'nothing touches it')
+    return _regular(best, units)
+
+
+def _averaged(recording: Recording) -> Iterator[tuple[Recording, Recording]]:
+    """
+    Yield the samples of a coarse record without disturbed blocks, and the means of the blocks.
+
+    Where the noise is small beside the step of the output, single steps look like motions. Means
+    over a block with an added noise of one step do not show them. They would not show a knock
+    or a small turn either, but the scatter in a block and the change between blocks do.
+
+    """
+    if not len(recording):
+        return
+    block = np.floor((recording['time'] - recording['time'][:1]) / _BLOCK_S)
+    starts = np.flatnonzero(np.diff(block, prepend=np.nan))
+    count = np.diff(starts, append=len(block))[:, np.newaxis]
+
+    def means(values: Floats) -> Floats:
+        sums: Floats = np.add.reduceat(values.reshape(len(block), -1), starts) / count
+        return sums.reshape(len(starts), *values.shape[1:])
+
+    reading = recording.reading - recording.reading[:1]
+    variance = np.maximum(means(reading ** 2) - means(reading) ** 2, 0.0)
+    usual = np.median(variance, axis=0)
+    step = min(filter(None, map(coarse_step, reading.T, np.sqrt(usual) / _NEAR_STEP)), default=0.0)
+    if step == 0.0:
+        return
+    calm = np.all(variance <= _DISTURBED * np.maximum(usual, step ** 2 / 4.0), axis=1)
+    sums = np.cumsum(means(reading), axis=0)
+    change = sums[2 * _AROUND:] - 2.0 * sums[_AROUND:-_AROUND] + sums[:-2 * _AROUND]
+    calm[1 + _AROUND:1 + _AROUND + len(change)] &= np.all(
+        np.abs(change) <= _AROUND * _MOVED * step, axis=1)
+    known = {key: means(recording[key])[calm] for key in ('time', 'reading', 'rate')
+             if key in recording}
+    known['reading'] += np.random.default_rng(0).normal(size=known['reading'].shape) * step
+    yield recording.take(np.repeat(calm, count[:, 0])), Recording(known, numbered(known))
+
+
+def coarse_step(values: Floats, noise: float) -> float:
+    """Return the step of the output if the noise of a sample is smaller, otherwise 0."""
+    levels = np.unique(values[:1_000_000])
+    if len(levels) > 4096:
+        return 0.0
+    gaps = np.diff(levels)
+    # Rounding of a computation leaves gaps that are not steps.
+    gaps = gaps[gaps > 1e-9 * max(float(np.max(np.abs(levels))), noise)]
+    step = float(np.min(gaps)) if len(gaps) else 0.0
+    return step if noise < _COARSE * step else 0.0
+
+
+def _uninterrupted(time: Floats, start: float, end: float) -> Iterator[tuple[int, int]]:
+    """Yield first index and end of the parts of a rest without interruptions."""
+    inside = np.flatnonzero((time >= start) & (time <= end))
+    step = np.diff(time[inside])
+    if not len(step):
+        return
+    # With the mean, because stamps that come in groups have a median near 0.
+    usual = float(np.median(step)) + float(np.mean(np.maximum(step, 0.0)))
+    cuts = (np.diff(inside) > 1) | (step < 0.0) | (step > _INTERRUPTED * usual)
+    for part in np.split(inside, np.flatnonzero(cuts) + 1):
+        yield int(part[0]), int(part[-1]) + 1
+
+
+def _regular(rest: Recording, units: Units) -> LongRest:
+    """Return the samples of a rest with equal spacing."""
+    time = rest['time']
+    step = np.diff(time)
+    usual = float(np.median(step))
+    notes = []
+    late = step > _LONG * usual
+    missing = np.maximum(np.round(step[late] / usual) - 1.0, 0.0).sum() if usual > 0.0 else np.inf
+    if not 0.0 < missing <= _MOST_MISSING * len(time):
+        rate = (len(time) - 1) / float(time[-1] - time[0])
+        mean = float(np.mean(step))
+        if float(np.std(step)) > _UNEVEN * mean:
+            notes.append(
+                f'the stamps are uneven ({np.min(step) * 1e3:.3g} to {np.max(step) * 1e3:.3g} ms '
+                f'apart): the samples are taken as regular, one each {mean * 1e3:.4g} ms')
+    else:
+        steps = np.where(late, np.maximum(np.round(step / usual), 1.0), 1.0)
+        place = np.append(0.0, np.cumsum(steps)).astype(np.int64)
+        rate = place[-1] / float(time[-1] - time[0])
+        rest = rest.take(np.searchsorted(place, np.arange(place[-1] + 1), side='right') - 1)
+        notes.append(f'{counted(int(missing), "sample")} of {len(rest)} are missing in the rest, '
+                     'and are replaced by the sample before')
+    values = units.to_g(rest.reading.T)
+    if 'rate' in rest:
+        values = np.concatenate([values, rest['rate'].T])
+    return LongRest(float(time[0]), rate, values, rest.columns.get('temperature'), tuple(notes))
+
+
+def whole(blocks: Iterable[Recording]) -> Recording:
+    """Return blocks of a recording as one, with the columns that all have."""
+    parts = [block for block in blocks if len(block)]
+    if not parts:
+        raise InputError('the recording has no samples, expected a long rest',
+                         'check that this is the intended file')
+    return concatenated(parts)
+
+
+def shown_unit(kind: str, figure: str, unit: str) -> tuple[str, float]:
+    """Return the unit of a figure for people, and the factor from the unit of the figure."""
+    if is_native(unit):
+        return _NATIVE[figure], 1.0
+    return _SHOWN[kind, figure]
 
 
 def notes_of(axes: Sequence[AxisNoise], temperature: tuple[float, float] | None) -> Iterator[str]:
@@ -125,7 +351,8 @@ def _need_of(axis: AxisNoise, figure: str, rest: LongRest) -> tuple[float, str]:
             hidden = _LENGTH_FOR_B * white.value**2 / flat if white.seen else 0.0
             seconds = max(_INSTABILITY_S, hidden)
         if axis.tau[-1] > axis.used[1]:  # the curve at long τ is not that of the components
-            return np.inf, _DISTURBED
+            return np.inf, ('the curve at long τ has another form (temperature or disturbance); '
+                            'record at a constant temperature')
         seconds = max(seconds, 4.0 * rest.seconds)  # two octaves more
     # Rounded up to one or two digits of its unit.
     unit = next(each for each in (_HOUR, _MINUTE, 1.0) if seconds >= 2.0 * each or each == 1.0)

@@ -27,29 +27,21 @@ fixed number of modes, the cost is linear in the number of poses.
 of one curve outside of the catalogue (`one_curve`). A second one that is too small for a value of
 each axis may still show with one value, in the proportion of the first.
 
-**Rivals** are effects that would explain the data about as well as a named one. The probability of
-an effect against its rivals follows from the score of the set with each of them in its place,
-exp(c score / 2), all else being equal (Kass and Raftery 1995), with the preference of the search
-for fewer values (`AS_GOOD` of `.beam`). The noise is estimated from the same equations, so
-differences are less certain: c is the share of the degrees of freedom that the set leaves.
-
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 import math
 from typing import cast, NamedTuple
 
 import numpy as np
 
-from .base import causes
-from .beam import AS_GOOD
-from .linear import Block, LEAST_OWN, LEVEL, Linear, outside_of, Set, with_outliers
-from .state import candidates, left_open, linearised, State
+from .linear import Block, LEAST_OWN, LEVEL, Linear, Set, with_outliers
+from .state import candidates, left_open, linearised, outside_of, State
 from ..effects import (
-    AXES, CATALOGUE, curves_over, EffectKey, EFFECTS, EmpiricalCurve, factors_of, LADDER, Model,
-    parameter_names, WANDER)
+    AXES, CATALOGUE, curves_over, EffectKey, EFFECTS, EmpiricalCurve, factors_of, Model,
+    parameter_names)
 from ..estimate import Fit, judge, left_out
 from ..table import Floats, Poses
 
@@ -72,6 +64,13 @@ _PROPORTION = 2.0
 
 _TURNS = np.linspace(0.0, np.pi, 1801)
 """Angles at which a proportion of two effects is looked for; the middle one is a right angle."""
+
+_EQUAL = 1e-9
+"""Relative difference below which numbers of a quantity are equal."""
+
+_OF_READING = 0.1
+"""Scatter of the ratio of a quantity to the length of the readings below which it is computed from
+them, relative to the scatter of the length."""
 
 
 class FoundCurve(NamedTuple):
@@ -104,6 +103,23 @@ class _Family(NamedTuple):
         parts = self.curve.parts
         alone = [(part, slice(k, None, len(parts))) for k, part in enumerate(parts)]
         return [('', slice(None)), *(alone if len(parts) > 1 else ())]
+
+
+def causes(poses_g: Poses) -> tuple[str, ...]:
+    """Return the quantities that vary, other than row numbers and lengths of the readings."""
+    length, found = np.linalg.norm(poses_g.reading, axis=1), []
+    for key in poses_g.quantities:
+        values = poses_g[key]
+        known = values[np.isfinite(values)]
+        if not len(known) or np.ptp(known) <= _EQUAL * np.max(np.abs(known)):
+            continue
+        steps, ratio = np.diff(values), values / length
+        counts_rows = np.all(np.abs(steps - steps[:1]) <= _EQUAL * np.abs(steps[:1]))
+        is_length = (np.std(ratio) * np.mean(length)
+                     < _OF_READING * np.std(length) * np.abs(np.mean(ratio)))
+        if not counts_rows and not is_length:
+            found.append(key)
+    return tuple(found)
 
 
 def best_curve(state: State, poses_g: Poses, out: tuple[int, ...], *, least: float = CLEARLY,
@@ -221,7 +237,7 @@ def _accepted(score: float, chosen: Set, tried: int) -> FoundCurve | None:
     blocks, first = sorted(chosen.blocks), chosen.entries[0]
     waves = [cast(EmpiricalCurve, chosen.linear.blocks[block].effect) for block in blocks]
     curve = replace(waves[0], modes=tuple(wave.modes[0] for wave in waves))
-    values = np.concatenate([*(chosen.values[block] for block in blocks), first.shape])
+    values = np.concatenate([*(chosen.parts[block] for block in blocks), first.shape])
     explained = 1.0 - _held_out(chosen) / max(_held_out(nothing), 1e-300)
     return FoundCurve(name=curve, values=values, score=score, out=chosen.out, p_value=p_value,
                       explained=explained)
@@ -421,91 +437,3 @@ def walk_beside(chosen: Set, process: Process) -> Walk:
 def _charge(linear: Linear) -> float:
     """Return what a walk costs in the score: its size, and its choice among the candidates."""
     return float(np.log(max(linear.dof, 2)) + linear.choice)
-
-
-LEAST = 0.01
-"""Smallest probability of a rival."""
-
-
-@dataclass(frozen=True)
-class Near:
-    """
-    What was chosen in the equations of all poses near a model.
-
-    The equations of `chosen` are whitened if there is a `walk`; those of `plain` are not. If no
-    walk is tried, `process` is None. `fitted` are the scores of other effects in the place of one,
-    by both names, and what is unusual costs them, where their own fit is not as good as these
-    equations predict.
-
-    """
-
-    chosen: Set
-    plain: Linear
-    walk: Walk | None
-    process: Process | None
-    fitted: Mapping[tuple[EffectKey, EffectKey], tuple[float, float]] = field(default_factory=dict)
-
-    @property
-    def beside(self) -> Set:
-        """Return what was chosen, in the equations that are not whitened."""
-        return self.chosen.within(self.plain)
-
-    @property
-    def names(self) -> tuple[EffectKey, ...]:
-        return self.chosen.effects
-
-    def block_of(self, name: EffectKey) -> int:
-        """Return the index of the block of a chosen effect."""
-        return self.chosen.blocks[self.names.index(name)]
-
-    def without(self, name: EffectKey) -> Set:
-        """Return what was chosen, without an effect."""
-        return self.chosen.without(self.block_of(name))
-
-    def score_above(self, base_rss: float) -> float:
-        """Return the score relative to a base that leaves this sum of squares."""
-        worth = self.plain.worth
-        return self.chosen.score + (worth + self.plain.dof) * math.log(
-            (worth + base_rss + 1e-300) / (worth + self.plain.base_rss + 1e-300))
-
-    @property
-    def key(self) -> tuple[frozenset[EffectKey], tuple[int, ...], bool]:
-        """Return what was chosen, apart from values and shapes."""
-        return frozenset(self.names), self.chosen.out, self.walk is not None
-
-
-def probabilities(name: EffectKey, near: Near, *, usual: bool = True) -> dict[EffectKey, float]:
-    """
-    Return the probabilities of an effect or `WANDER` and those in its place, largest first.
-
-    `usual`: effects that are far larger than in common sensors are less probable; otherwise, the
-    data alone decide.
-
-    """
-    if name != WANDER and name not in near.names:
-        return {name: 1.0}
-    whole = near.plain.worth + near.plain.dof
-    certainty = max((whole - near.chosen.parameters) / whole, LEAST)
-    back = 0.0 if usual else 1.0
-    others = near.beside if name == WANDER else near.without(name)
-    scores: dict[EffectKey, float] = {name: near.chosen.score + back * near.chosen.unusual}
-    least = 2.0 * np.log(LEAST) / certainty + scores[name] - back * others.unusual
-    for number, likely in enumerate(others.scores_beside):
-        effect = others.linear.blocks[number].effect
-        if (likely > least and effect not in near.names
-                and (effect in LADDER or name not in LADDER)):
-            larger = others.extended(number)
-            score = larger.score + back * larger.unusual - AS_GOOD * float(
-                np.sign(larger.parameters - near.chosen.parameters))
-            scores[effect] = max(score, scores.get(effect, -np.inf))
-    if name != WANDER and near.walk is None and near.process is not None:
-        scores[WANDER] = walk_beside(others, near.process).score + back * others.unusual
-    for other in scores:
-        own, unusual = near.fitted.get((name, other), (np.inf, 0.0))
-        scores[other] = min(scores[other], own + back * unusual)
-    most = max(scores.values())
-    weights = {key: float(np.exp(certainty * (score - most) / 2.0))
-               for key, score in scores.items()}
-    total = sum(weights.values())
-    ordered = sorted(weights, key=lambda key: -weights[key])
-    return {key: weights[key] / total for key in ordered}

@@ -36,11 +36,14 @@ counts as one effect, and each quantity as one of its shapes: the more quantitie
 them costs, and the effects of the catalogue cost the same. Each pose that is left out costs
 2 log n + 5: it is selected among n poses, and few poses are knocked.
 
+`extend_each` extends sets by one effect, `choose_shapes` chooses the shapes of their effects
+again, and `with_outliers` finds their outliers: the steps of the search in `.settle`.
+
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate, groupby
@@ -72,6 +75,16 @@ _RARE = 5.0
 
 LEAST_OWN = 0.02
 """Smallest 1 - leverage; below it, an equation alone determines a value."""
+
+_BRANCHES = 5
+"""Number of effects by which a set is extended."""
+
+_TESTED = 6
+"""Number of extended sets whose shapes and outliers are found again."""
+
+_DECIMALS = 6
+"""Decimals of the scores that sets are sorted by: not the last bit of a processor decides, and
+equal scores keep their order."""
 
 
 class Block(NamedTuple):
@@ -295,6 +308,15 @@ class Set:
     def without(self, block: int) -> Set:
         return self.instead(other for other in self.blocks if other != block)
 
+    @property
+    def smaller(self) -> list[Set]:
+        """Return a set of several effects without each of them."""
+        return [self.without(block) for block in self.blocks if len(self.blocks) > 1]
+
+    def without_effects(self, effects: Collection[EffectKey]) -> Set:
+        return self.instead(block for block in self.blocks
+                            if self.linear.blocks[block].effect not in effects)
+
     @cached_property
     def rss(self) -> float:
         gain = self.across[:, -1] @ self.across[:, -1]
@@ -316,7 +338,7 @@ class Set:
         """Return the penalty for effects that are far larger than in common sensors."""
         if not self.blocks:
             return 0.0
-        largest = np.array([np.max(np.abs(values)) for values in self._parts])
+        largest = np.array([np.max(np.abs(part)) for part in self.parts.values()])
         typical = [each.entry.typical for each in self.entries]
         away = np.log(np.maximum(largest / typical, 1.0)) / _USUAL
         return float(np.sum(np.minimum(away ** 2, _MOST_UNUSUAL)))
@@ -335,16 +357,17 @@ class Set:
         return tuple(each.effect for each in self.entries)
 
     @cached_property
-    def values(self) -> dict[int, Floats]:
-        """Return the (p,) values of the effect of each block."""
-        return dict(zip(self.blocks, self._parts, strict=True))
-
-    @cached_property
-    def _parts(self) -> Sequence[Floats]:
-        """Return the values of the effect of each block, in the order of the blocks."""
+    def parts(self) -> dict[int, Floats]:
+        """Return the (p,) values of the columns of each block."""
         values = self.mix[len(self.root):] @ self.across[:, -1] / self.linear.sizes[self._index]
         ends = accumulate(each.columns.stop - each.columns.start for each in self.entries)
-        return np.split(values, list(ends))[:-1]
+        return dict(zip(self.blocks, np.split(values, list(ends))))
+
+    @property
+    def values(self) -> dict[EffectKey, Floats]:
+        """Return the values of each effect, which end with those of its shape."""
+        return {each.effect: np.concatenate([part, each.shape])
+                for each, part in zip(self.entries, self.parts.values(), strict=True)}
 
     @property
     def _index(self) -> list[int]:
@@ -429,9 +452,9 @@ def with_outliers(sets: Iterable[Set]) -> Iterator[Set]:
     new = {frozenset(chosen.blocks): Set.of(chosen.linear, chosen.blocks) if chosen.out else chosen
            for chosen in sets if frozenset(chosen.blocks) not in chosen.linear.outliers}
     if new:  # at once, which is faster
-        linear = sets[0].linear
+        linear, spanned = sets[0].linear, [whole.spanned for whole in new.values()]
         parts = [by_pose(residual, np.hstack([linear.onto, onto]), linear.pose)
-                 for onto, residual in (whole.spanned for whole in new.values())]
+                 for onto, residual in spanned]
         basis = np.zeros((len(parts), *parts[0].residual.shape,
                           max(part.columns.shape[2] for part in parts)))
         for own, part in zip(basis, parts, strict=True):
@@ -474,24 +497,51 @@ def is_seen(squares: Floats) -> NDArray[np.bool_]:
     return (squares > SEEN ** 2) & (squares > SEEN ** 2 * squares[..., -1:])
 
 
-def outside_of(onto: Floats, columns: Floats) -> tuple[Floats, Floats]:
-    """Return (m, c) columns of norm 1 with a base projected out, and their (c,) norms before."""
-    sizes = _norms(columns)
-    rows = columns.T / sizes[:, np.newaxis]
-    rows -= (rows @ onto) @ onto.T
-    return rows.T, np.where(sizes < np.inf, sizes, 1.0)
+def extend_each(front: list[Set]) -> list[Set]:
+    """Return the best sets with one effect more than those of a front."""
+    likely: list[tuple[float, Set, int]] = []  # the largest possible score, a set, a new block
+    for before in front:
+        linear, scores = before.linear, before.scores_beside
+        tops: dict[EffectKey, tuple[float, int]] = {}
+        for effect, numbers in linear.numbers_of.items():
+            number = int(numbers[np.argmax(scores[numbers])])
+            if scores[number] > -np.inf and not is_barred(linear.blocks[number], before.entries):
+                tops[effect] = round(float(scores[number]), _DECIMALS), number
+        likely += [(score + before.unusual, before, number) for score, number in sorted(
+            tops.values(), key=lambda each: -each[0])[:_BRANCHES]]
+    likely.sort(key=lambda each: -each[0])
+    front[0].linear.products_with([number for _, _, number in likely[:_TESTED]])  # at once: fast
+    best: list[Set] = []
+    for most, before, number in likely:
+        if len(best) == _TESTED and best[-1].score > most:
+            break
+        best = best_of_each([*best, before.extended(number)])[:_TESTED]
+    return best
 
 
-def orthonormal(columns: Floats) -> Floats:
-    """Return orthonormal columns with the span of others."""
-    if not columns.shape[1]:
-        return columns
-    vectors, scales, _ = np.linalg.svd(columns / _norms(columns), full_matrices=False)
-    return np.asarray(vectors[:, scales > 1e-6 * scales[0]])
+def choose_shapes(chosen: Set) -> Set:
+    """Choose the shape of each effect again, with the others as they are."""
+    for place, number in enumerate(chosen.blocks[:-1]):
+        effect = chosen.effects[place]
+        if len(chosen.linear.numbers_of[effect]) == 1:
+            continue
+        before, after = chosen.blocks[:place], chosen.blocks[place + 1:]
+        best = chosen.instead((*before, *after)).best_of(effect)
+        if best != number:
+            new = chosen.instead((*before, best, *after))
+            chosen = max(chosen, new, key=lambda either: either.score)
+    return chosen
 
 
-def _norms(columns: Floats) -> Floats:
-    """Return the norms of columns, infinite for a column of zeros, which remains one."""
-    sizes: Floats = np.sqrt(np.einsum('mc,mc->c', columns, columns))
-    sizes[sizes < 1e-100] = np.inf  # products of smaller numbers underflow
-    return sizes
+def best_of_each(sets: Iterable[Set]) -> list[Set]:
+    """Return the best set of each list of effects and outliers, the best score first."""
+    best: dict[tuple[frozenset[EffectKey], tuple[int, ...]], Set] = {}
+    for chosen in sorted(sets, key=lambda chosen: -round(chosen.score, _DECIMALS)):
+        best.setdefault((frozenset(chosen.effects), chosen.out), chosen)
+    return list(best.values())
+
+
+def is_barred(block: Block, present: Iterable[Block]) -> bool:
+    """Return whether one of the effects present is that of a block, contains it or is in it."""
+    return any(block.effect == other.effect or block.effect in other.entry.includes
+               or other.effect in block.entry.includes for other in present)

@@ -4,7 +4,13 @@
 """
 The refinement of a calibration: from poses and a base to the record of the result.
 
-See `.search` for the method, and `.base` for a stored calibration as the base.
+See `.search` for the method.
+
+**Stored calibration as the base.** The calibration is the simulation, and the new poses are the
+measurement. The poses of the calibration are added to the new poses, without their times, because
+the clocks of two recordings can differ. If the file was edited by hand, or the new poses are
+partly those of the calibration and contradict it, the readings that the calibration predicts
+replace its measured ones.
 
 **Typical values of a fleet.** The search for effects is that without a fleet, because a fleet says
 nothing about effects beyond offset, gain and cross-axis. It needs more poses than model 10 has
@@ -25,9 +31,10 @@ from html import escape
 from importlib import import_module
 
 import numpy as np
+from numpy.typing import NDArray
+import scipy
 
-from .base import beside_stored, sampled, with_stored
-from .search import Found, search
+from .search import Found, sampled, search, with_changes
 from .state import fitted_state, is_noise, State
 from .steps import (
     find_rivals, not_testable, Remark, remarks_on, Stage, Step, steps_of, untestable, Verdict,
@@ -38,11 +45,12 @@ from ..calibration import (
     quality_of, record_of, refuse_if_unfit, Rejected, rejected_by, sound_rows, sure_rows,
     uncertainty_g, with_rest_noise)
 from ..effects import (
-    add_history, CHANGES, EffectKey, included, Model, MODELS, OwnEffect, parameter_names,
-    PROCESSES, unchanged, with_vector)
+    add_history, covariance_of_steps, EffectKey, Model, MODELS, OwnEffect, PROCESSES, unchanged,
+    with_vector)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
-from ..estimate import fit_sphere, judge, NotConvergedError, outliers, variance_factor
-from ..finding import explained_by, Finding, without as without_kinds
+from ..estimate import (
+    estimate, fit_sphere, judge, NotConvergedError, originals, outliers, variance_factor)
+from ..finding import explained_by, Finding, has, without as without_kinds
 from ..geometry import unit
 from ..table import check_units, Floats, Poses, Record
 from ..text import counted, table
@@ -63,6 +71,12 @@ _NAMED = 4
 _LEAST_CHECKS = 4
 """Smallest number of equations beyond values with which a refinement is used. With fewer, of 12
 simulated poses, a wrong effect explains as much as the true one, and new poses read worse."""
+
+_WARMER = 1e-3
+"""Difference of temperature for the slope of a reading [°C]."""
+
+_SAME = 0.999
+"""Quantile of chi² below which a stored calibration agrees with poses of its fit."""
 
 _BASE = '10'
 _ORIENTATION = ('reference', 'orientation')
@@ -216,6 +230,8 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
                               f'{_LEAST_POSES} to find an effect', 'take 24 poses or more')
     stored = base if isinstance(base, Calibration) else None
     calibration = stored or base_of(poses, units, str(base))
+    # Copies would count as further evidence, and leave nothing unseen that is held out.
+    sound = sound.take(np.unique(originals(in_g(sound, calibration.units))))
 
     def at(model: Model) -> Poses:
         known = add_history(in_g(sound, calibration.units), model)
@@ -272,9 +288,34 @@ def _is_same_way(model: Model, *ways: Poses) -> bool:
     return bool(np.max(np.abs(one - other), initial=0.0) < 1e-5)
 
 
+def _with_steps(final: State, poses: Poses) -> State:
+    """
+    Return a state with what a thermometer with steps adds to its covariance.
+
+    To first order, the errors dT of the temperatures at the poses move the values by
+    -J⁺ (∂reading/∂T dT), with J the derivative of the equations.
+
+    """
+    fit, model = final.fit.beside or final.fit, final.model
+    if not {'time', 'temperature'} <= {*poses.columns} or 'temperature' not in model.over:
+        return final
+    context, near = fit.context, fit.equations
+    warmer = {**context, 'temperature': context['temperature'] + _WARMER}
+    slope = np.nan_to_num(model.at(warmer).reading(near.force)
+                          - model.at(context).reading(near.force)) / _WARMER
+    rows = np.sum(near.columns(Model({'offset': np.zeros(3)})) * slope[near.pose], axis=1)
+    onto, order = np.zeros((len(poses), fit.columns.shape[1])), np.argsort(poses.row)
+    place = np.searchsorted(poses.row, fit.poses_g.row[near.pose], sorter=order)
+    own = place < len(poses)  # not the poses of a stored calibration
+    np.add.at(onto, order[place[own]], (np.linalg.pinv(fit.columns) * rows).T[own])
+    spread = covariance_of_steps(poses['time'], poses['temperature'], onto.T)
+    return State(replace(final.fit, of_context=fit.ties @ spread @ fit.ties.T))
+
+
 def _conclude(calibration: Calibration, found: Found, given: Given) -> Refinement:
     """Return the refinement of a calibration by what a search has found."""
-    start, final = found.base, found.final
+    start, final = found.base, _with_steps(found.final, given.poses)
+    found = replace(found, final=final)
     if given.stored:  # as stored, without a fit
         kept = calibration.held(start.poses_g)
         start = State(judge(Model(calibration.model.values), kept))
@@ -397,33 +438,6 @@ def base_of(poses: Poses, units: Units, name: str) -> Calibration:
                      reason='ideal')
 
 
-def with_changes(model: Model) -> tuple[Model, Floats]:
-    """
-    Return a model with the changes since the stored calibration included in its effects.
-
-    The (q, p) matrix maps the values of `model` to those of the result.
-
-    """
-    effects: list[EffectKey] = []
-    for name in sorted(model.effects, key=CHANGES.__contains__):  # the changes last
-        own = unchanged(name)
-        contained = included((own,)).intersection(effects)
-        if contained:
-            effects[effects.index(contained.pop())] = own
-        elif own not in effects and own not in included(effects):
-            effects.append(own)
-    names = parameter_names(tuple(effects))
-    owners: list[tuple[str, ...]] = []
-    for own in map(unchanged, model.effects):  # of each value, those of the result it adds to
-        whole = tuple(effect for effect in effects if own in included((effect,)))
-        owners += [(value,) if own in effects else parameter_names(whole)
-                   for value in parameter_names((own,))]
-    matrix = np.array([[name in owner for owner in owners] for name in names], float)
-    matrix = matrix.reshape(len(names), len(owners))
-    values = with_vector(tuple(effects), matrix @ model.vector).values
-    return Model(values, model.rotation), matrix
-
-
 @dataclass(frozen=True)
 class Given:
     """The input poses, those used [g], whether the base is stored, rejected rows, and notes."""
@@ -478,7 +492,7 @@ def refitted(before: Calibration, poses: Poses, *, sensor: str = '', date: str =
     out = [Rejected(int(row), 'outlier', 'outlier') for row in poses_g.row
            if row not in final.poses_g.row]
     given = Given(poses, poses_g, stored=True, rejected=(*doubts, *unsound, *out), notes=())
-    calibration, refusal = refined_calibration(before, final, (), given)
+    calibration, refusal = refined_calibration(before, _with_steps(final, poses), (), given)
     if refusal:
         raise RefusedFitError(*refusal)
     return replace(calibration, reason=before.reason, sensor=sensor or before.sensor, date=date)
@@ -491,7 +505,10 @@ def refined_calibration(base: Calibration, final: State, added: tuple[EffectKey,
     kept, poses = final.poses_g, given.poses
     if 'new' in kept:  # beside the poses of the stored calibration
         if final.model.effects == model.effects and all(key in base.poses for key in model.needs):
-            poses = with_stored(given.poses, base)
+            stored = base.used_poses
+            poses = replace(poses, row=_rows(poses, stored), columns={
+                key: np.concatenate([values, stored[key]])
+                for key, values in poses.columns.items() if key in stored})
         else:
             kept = kept.take(kept['new'] > 0.0)
     at_poses = judge(model, kept if base.form.known_orientation
@@ -536,3 +553,50 @@ def _determined(refined: Calibration, final: State) -> tuple[Calibration, tuple[
                          TAKE_ALL_SIDES)
     own = without_kinds(fit_findings(fit, dilution), 'beyond_noise')  # the verdict states it
     return replace(refined, noted=(*refined.noted, *own)), ()
+
+
+def beside_stored(poses_g: Poses, calibration: Calibration, model: Model) -> Poses:
+    """
+    Return new poses in g followed by those of a stored calibration, with the column ``new``.
+
+    The ways between the poses of the calibration are those that `model` corrects.
+    Return only the new poses, without this column, if the calibration has no effects or no poses,
+    or was fitted to some of the new poses and still agrees with them.
+
+    """
+    stored = add_history(in_g(calibration.poses, calibration.units), model)
+    stored = stored.take(np.isin(stored.row, calibration.used_poses.row))
+    if not len(stored) or not calibration.model.effects:
+        return poses_g
+    new, old = ({tuple(row) for row in poses.reading.round(7).tolist()}  # files round
+                for poses in (poses_g, stored))
+    shared, edited = not new.isdisjoint(old), has(calibration.noted, 'edited')
+    if shared and not edited:
+        as_stored = Model(calibration.model.values)
+        fit = estimate(as_stored, poses_g)
+        excess = judge(as_stored, calibration.held(poses_g)).chi2 - fit.chi2
+        worse = max(fit.chi2 / max(fit.dof, 1), 1.0)
+        if excess / worse < scipy.special.chdtri(len(as_stored.vector), 1.0 - _SAME):
+            return poses_g  # a fit is no better than the calibration
+    if shared or edited:  # with the readings that the calibration predicts in their directions
+        here = calibration.model.at(stored.columns)
+        stored = stored.with_columns(reading=here.reading(unit(here.force(stored.reading))))
+    ours, count = {**poses_g.columns, 'new': np.ones(len(poses_g))}, len(stored)
+    optional = ('temperature', 'supply_voltage', 'rate', 'previous', *poses_g.quantities)
+    unknown = {key: np.full((count, *ours[key].shape[1:]), np.nan)
+               for key in optional if key in ours}
+    theirs = {**unknown, **stored.columns, 'new': np.zeros(count)}
+    if 'time' in calibration.ranges:  # limited to the range of the calibration
+        ours['time'] = np.clip(ours['time'], *calibration.ranges['time'])
+    elif 'time' in ours:
+        theirs['time'] = np.full(count, np.nan)
+    if 'orientation' in ours:
+        theirs['orientation'] = np.min(ours['orientation']) - 1.0 - np.arange(count)
+    columns = {key: np.concatenate([values, theirs[key]])
+               for key, values in ours.items() if key in theirs}
+    joined = Poses(columns, _rows(poses_g, stored))
+    return joined if joined.noise is not None else joined.without_columns('std', 'count')
+
+
+def _rows(poses: Poses, stored: Poses) -> NDArray[np.int64]:
+    return np.concatenate([poses.row, int(poses.row.max()) + 1 + np.arange(len(stored))])

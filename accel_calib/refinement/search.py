@@ -6,8 +6,8 @@ The search for missing effects.
 
 1. The effects of the ladder (offset, gain, gain by axis, cross-axis) that the base lacks are
    added.
-2. A beam search (`.beam`) finds the set of effects, outliers and a random walk of the offset with
-   the best score, in the equations near the model.
+2. A beam search (`.settle`) finds the set of effects, outliers and a random walk of the offset
+   with the best score, in the equations near the model.
 3. All values are fitted again, without the outliers, and the equations are set up near the new
    model. Steps 2 and 3 are repeated until the set remains the same, and again with products of two
    columns if a gap or a walk remains.
@@ -23,6 +23,13 @@ The search for missing effects.
 
 A set is kept only if its fit converged, the cost decreased and its values are plausible.
 
+**Long tables.** A sample of a long table bounds the time and the memory of a refinement; such
+tables come from machines, or are samples in place of poses. With `MOST` equations a refinement
+takes 10 s and 300 MB as a rule, and about a minute and 900 MB in the worst case: all context, and
+noise that no effect explains. A pose has one equation, or three if its orientation is known or
+shared. The sample takes one pose out of each part of the table. The place in the part changes by
+the golden ratio, so that a table that repeats the same turns gives all of them.
+
 """
 
 from __future__ import annotations
@@ -36,17 +43,22 @@ import numpy as np
 from numpy.typing import NDArray
 import scipy
 
-from .base import causes, Clipped, off_grid, unclipped
 from .curves import (
-    best_curve, CLEARLY, FoundCurve, Near, one_curve, process_of, SIGNIFICANT, Walk, walk_beside)
+    best_curve, causes, CLEARLY, FoundCurve, one_curve, process_of, SIGNIFICANT, Walk, walk_beside)
 from .linear import LEVEL, Set
-from .settle import fit_without, make_sound, settle
-from .state import beginning, Candidate, fitted_state, linearised, State, without
+from .settle import fit_without, make_sound, Near, settle
+from .state import (
+    beginning, Candidate, Clipped, fitted_state, linearised, off_grid, State, unclipped, without)
 from ..effects import (
     CHANGES, Covariate, COVARIATES, EffectKey, EFFECTS, entry_of, factors_of, included, LADDER,
-    linear_values, Model, OwnEffect, parameter_names, WANDER)
+    linear_values, Model, OwnEffect, parameter_names, unchanged, WANDER, with_vector)
 from ..estimate import beside_scatter, kinds, scatter_of, stated
 from ..table import CONTEXT, Floats, Poses
+
+MOST = 6000
+"""Largest number of equations that a refinement uses."""
+
+_GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 _TIMED = 30.0
 """A curve over time must have a score better than a walk by this."""
@@ -76,19 +88,47 @@ _HELD_OUT = 0.7
 finds a curve over some quantity for an offset that wanders, which explains less."""
 
 
+def sampled(poses: Poses) -> Poses:
+    """Return the poses for `MOST` equations, and as many of those of a stored calibration."""
+    most = MOST // (3 if {'reference', 'orientation'} & set(poses.columns) else 1)
+    if len(poses) <= most:
+        return poses
+    new = poses['new'] > 0.0 if 'new' in poses else np.ones(len(poses), bool)
+    parts = []
+    for part in (np.flatnonzero(new), np.flatnonzero(~new)):
+        count = len(part)
+        kept = _spread(count, most)
+        if 'orientation' in poses and count > most:
+            group = np.unique(poses['orientation'][part], return_inverse=True)[1]
+            groups = int(group.max()) + 1
+            whole = np.flatnonzero(np.isin(group, _spread(groups, max(most * groups // count, 1))))
+            if most // 2 <= len(whole) <= 2 * most:
+                kept = whole  # all poses of some orientations
+        parts.append(part[kept])
+    return poses.take(np.sort(np.concatenate(parts)))
+
+
+def _spread(count: int, wanted: int) -> NDArray[np.intp]:
+    """Return at most `wanted` different indices, one out of each part of the range."""
+    if count <= wanted:
+        return np.arange(count)
+    part = np.arange(wanted)
+    return np.unique(((part + part * _GOLDEN % 1.0) * (count / wanted)).astype(np.intp))
+
+
 @dataclass(frozen=True)
 class Found:
     """
     The result of a search.
 
     `base` and `final` are the states before and after it, with the same poses. `outliers` (d,) are
-    the indices of the outliers. `near` has the equations near the final model; `walk` is beside it
-    at the poses kept. `added` are the added effects, in order, with `WANDER` last if the rest is a
-    random walk of the offset; they are listed at the end of a search. `taken_back` are effects
-    that were removed because they explain too little, or no more than by chance. Poses at the
-    limit of the sensor are left out: they are `clipped`, and `with_clipped` is the base fitted to
-    all poses. `grid_g` is the step of the grid of the readings [g], if it is relevant. `also`
-    are the own effects that were asked for.
+    the indices of the outliers. `near` has the equations near the final model. `added` are the
+    added effects, in order, with `WANDER` last if the rest is a random walk of the offset; they
+    are listed at the end of a search. `taken_back` are effects that were removed because they
+    explain too little, or no more than by chance. Poses at the limit of the sensor are left out:
+    they are `clipped`, and `with_clipped` is the base fitted to all poses. `grid_g` is the step of
+    the grid of the readings [g], if it is relevant. `also` are the own effects that were asked
+    for.
 
     """
 
@@ -96,7 +136,6 @@ class Found:
     final: State
     outliers: NDArray[np.intp]
     near: Near
-    walk: Walk | None = None
     curve: FoundCurve | None = None
     added: tuple[EffectKey, ...] = ()
     taken_back: tuple[EffectKey, ...] = ()
@@ -104,6 +143,20 @@ class Found:
     grid_g: float | None = None
     with_clipped: State | None = None
     also: tuple[OwnEffect, ...] = ()
+
+    @cached_property
+    def walk(self) -> Walk | None:
+        """Return the walk beside the final model, at the poses kept."""
+        linear = self.final.linear
+        process = process_of(linear, self.final.poses_g) if self.near.walk is not None else None
+        return None if process is None else walk_beside(Set.of(linear), process)
+
+    @cached_property
+    def left(self) -> tuple[Floats, Floats]:
+        """Return the final residual without the walk, and the same held out."""
+        if self.walk is None:
+            return self.final.residual, self.final.held_out
+        return self.walk.residuals(Set.of(self.final.linear), self.final.fit.equations.force)
 
     @cached_property
     def one_curve(self) -> tuple[str, ...]:
@@ -125,10 +178,9 @@ def search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...] = ()) -> Fou
         poses_g = poses_g.take(everyone)
     poses_g, grid = off_grid(poses_g, base)
     found = _search(poses_g, base, also)
-    for again in (_with_own_noise, _with_scatter):
-        found = again(found, poses_g, base, also)
-    base_state, final = _weighted(found.base), _weighted(found.final)
-    return replace(found, base=base_state, final=final, walk=_walk(final, found.near),
+    again = _with_own_noise if 'new' in poses_g else _with_scatter
+    found = again(found, poses_g, base, also)
+    return replace(found, base=_weighted(found.base), final=_weighted(found.final),
                    outliers=everyone[found.outliers], clipped=clip, grid_g=grid,
                    with_clipped=whole, also=also)
 
@@ -143,8 +195,7 @@ def _with_own_noise(found: Found, poses_g: Poses, base: Model, also: tuple[OwnEf
 
     """
     near, noise = found.near, poses_g.noise
-    if noise is None or 'new' not in poses_g or not near.plain.worth or not (
-            found.walk or found.curve):
+    if noise is None or not near.plain.worth or not (found.walk or found.curve):
         return found
     onto, residual = near.beside.spanned
     own = 1.0 - np.sum(near.plain.onto ** 2, axis=1) - np.sum(onto ** 2, axis=1)
@@ -165,7 +216,7 @@ def _with_scatter(found: Found, poses_g: Poses, base: Model, also: tuple[OwnEffe
     If their noise differs, the quiet ones have too much weight, and effects fit their scatter.
 
     """
-    if not found.added or 'new' in poses_g:
+    if not found.added:
         return found
     scatter, largest = scatter_of(found.base.fit), np.inf
     near = found.near
@@ -194,8 +245,7 @@ def _weighted(state: State) -> State:
 def _beside(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
     """Search in poses with a scatter, and state the result without it."""
     found = _search(poses_g, base, also)
-    first, final = (State(stated(state.fit)) for state in (found.base, found.final))
-    return replace(found, base=first, final=final, walk=_walk(final, found.near))
+    return replace(found, base=State(stated(found.base.fit)), final=State(stated(found.final.fit)))
 
 
 def _search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
@@ -206,15 +256,15 @@ def _search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
     ladder = near.names
     fixed = (*base.effects, *ladder)
     fixed = tuple(name for name in fixed if name not in included(fixed))
-    present = {*map(str, fixed)}
+    quantities = causes(poses_g)
     names: tuple[EffectKey, ...] = (
         *_visible(begun, LADDER), *(name for name in EFFECTS if name not in LADDER),
-        *(own for own in also if own.name not in present),
-        *(Covariate(part, (quantity,), power) for quantity in causes(poses_g)
+        *(own for own in also if own.name not in {*map(str, fixed)}),
+        *(Covariate(part, (quantity,), power) for quantity in quantities
           for part in COVARIATES for power in (1, 2)),
         *_visible(begun, CHANGES))
     state, near, trial = settle(begun, poses_g, fixed, names)
-    varied = {*causes(poses_g), *(column for column in CONTEXT if column in poses_g)}
+    varied = {*quantities, *(column for column in CONTEXT if column in poses_g)}
     if len(varied) <= _MOST_VARIED and (near.walk is not None or not state.is_noise):
         products: tuple[EffectKey, ...] = tuple(
             Covariate(part, pair) for pair in combinations(sorted(varied), 2)
@@ -231,18 +281,21 @@ def _search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
         near = replace(near, chosen=near.chosen.instead(()))
     out = near.chosen.out
     first = fit_without(start, poses_g, out) if out else start
-    found = Found(first, state, np.array(out, np.intp), near, _walk(state, near),
-                  taken_back=taken_back)
-    chance = tuple(name for name in near.names if _is_coincidence(found, name))
-    fewer = _less(found, chance)
-    found = found if fewer is None else replace(fewer, taken_back=chance)
-    found = _described(found, start, poses_g)
+    found = Found(first, state, np.array(out, np.intp), near, taken_back=taken_back)
+    found = _described(_without_chance(found), start, poses_g)
     state, near = make_sound(found.final, found.near, trial, found.base.model, ladder)
     there = {*state.model.values, *included(state.model.values), WANDER} - _of_a_turn(state)
     beyond = (*ladder, *near.names, *(() if found.curve is None else (found.curve.name,)),
               *(() if near.walk is None else (WANDER,)))
-    return replace(found, final=state, near=near, walk=_walk(state, near),
+    return replace(found, final=state, near=near,
                    added=tuple(name for name in beyond if name in there))
+
+
+def _without_chance(found: Found) -> Found:
+    """Return what was found, without the effects that are a coincidence."""
+    chance = tuple(name for name in found.near.names if _is_coincidence(found, name))
+    fewer = _less(found, chance)
+    return found if fewer is None else replace(fewer, taken_back=chance)
 
 
 def _is_coincidence(found: Found, name: EffectKey) -> bool:
@@ -268,7 +321,8 @@ def _is_coincidence(found: Found, name: EffectKey) -> bool:
     factors = moved[~alike][:, :, np.argsort(order)]  # (s, t or 1, n)
     if len(factors) < 2:
         return False
-    shifted = Candidate(name, (shape,) * len(factors), tuple(range(len(factors))), 1.0, factors)
+    shifted = Candidate(name, entry, (shape,) * len(factors), tuple(range(len(factors))),
+                        tried=1.0, factors=factors)
     linear = linearised(state.fit, tuple(each for each in values if each != name), (shifted,))
     *others, own = Set.of(linear).gains()[0]
     return bool(max(others) > own)
@@ -331,7 +385,7 @@ def _with_curve(found: Found, curve: FoundCurve, start: State, poses_g: Poses) -
         return None
     near = replace(found.near, walk=None, chosen=found.near.beside)
     return replace(found, base=fit_without(start, poses_g, curve.out), final=after, near=near,
-                   walk=None, curve=curve, outliers=np.array(curve.out, np.intp))
+                   curve=curve, outliers=np.array(curve.out, np.intp))
 
 
 def _less(found: Found, names: Collection[EffectKey]) -> Found | None:
@@ -341,15 +395,11 @@ def _less(found: Found, names: Collection[EffectKey]) -> Found | None:
     None if there are no such effects, or if the fit without them fails.
 
     """
-    values = {name: part for name, part in found.final.model.values.items() if name not in names}
-    state = fitted_state(Model(values), found.final.poses_g) if names else None
+    state = found.final.refit_without(names) if names else None
     if state is None:
         return None
-    chosen = found.near.beside
-    blocks = [block for block, name in zip(chosen.blocks, chosen.effects, strict=True)
-              if name not in names]
-    near = replace(found.near, walk=None, chosen=chosen.instead(blocks))
-    fewer = replace(found, final=state, near=near, walk=None)
+    near = replace(found.near, walk=None, chosen=found.near.beside.without_effects(names))
+    fewer = replace(found, final=state, near=near)
     return fewer if found.walk is None else _walking(fewer) or fewer
 
 
@@ -362,7 +412,7 @@ def _walking(found: Found) -> Found | None:
     if walk is None or walk.likelihood_ratio < SIGNIFICANT:
         return None
     near = replace(near, walk=walk, chosen=near.chosen.within(walk.whitened(near.plain)))
-    return replace(found, near=near, walk=_walk(found.final, near))
+    return replace(found, near=near)
 
 
 def _is_better(curve: FoundCurve, near: Near) -> bool:
@@ -408,6 +458,28 @@ def _of_a_turn(state: State) -> set[EffectKey]:
     return set(gains) if chi2 < scipy.special.chdtri(len(away), LEVEL) else set()
 
 
-def _walk(state: State, near: Near) -> Walk | None:
-    process = None if near.walk is None else process_of(state.linear, state.poses_g)
-    return None if process is None else walk_beside(Set.of(state.linear), process)
+def with_changes(model: Model) -> tuple[Model, Floats]:
+    """
+    Return a model with the changes since the stored calibration included in its effects.
+
+    The (q, p) matrix maps the values of `model` to those of the result.
+
+    """
+    effects: list[EffectKey] = []
+    for name in sorted(model.effects, key=CHANGES.__contains__):  # the changes last
+        own = unchanged(name)
+        contained = included((own,)).intersection(effects)
+        if contained:
+            effects[effects.index(contained.pop())] = own
+        elif own not in effects and own not in included(effects):
+            effects.append(own)
+    names = parameter_names(tuple(effects))
+    owners: list[tuple[str, ...]] = []
+    for own in map(unchanged, model.effects):  # of each value, those of the result it adds to
+        whole = tuple(effect for effect in effects if own in included((effect,)))
+        owners += [(value,) if own in effects else parameter_names(whole)
+                   for value in parameter_names((own,))]
+    matrix = np.array([[name in owner for owner in owners] for name in names], float)
+    matrix = matrix.reshape(len(names), len(owners))
+    values = with_vector(tuple(effects), matrix @ model.vector).values
+    return Model(values, model.rotation), matrix

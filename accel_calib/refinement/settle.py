@@ -2,30 +2,68 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-From a set of effects to a fitted model in which each of them is sound.
+The search for the best sets of effects, and the fitted model in which each effect is sound.
 
-A search finds a set in equations near a model, and a fit makes the next model: `settle` repeats
-both until the set remains the same. `make_sound` checks the effects of the final model, and
-removes or exchanges them.
+**Beam search.** The search keeps the best few sets by the score of `.linear`, and extends each by
+one effect at a time. After each extension the shapes are chosen again, and the outliers are found
+again among all poses, with and without the earlier ones. So a pair may be found of which neither
+effect is visible alone, and an effect is not judged by poses that were knocked. A set is accepted
+only if each of its effects is significant beside the others. With a walk of the offset
+(`.curves`), the search is repeated with equations whitened for it, and the score includes it.
+
+**Search and fit.** The search finds a set in equations near a model, and a fit makes the next
+model: `settle` repeats both until the set remains the same. `make_sound` checks the effects of the
+final model, and removes or exchanges them.
+
+**Rivals** are effects that would explain the data about as well as a named one. The probability of
+an effect against its rivals follows from the score of the set with each of them in its place,
+exp(c score / 2), all else being equal (Kass and Raftery 1995), with the preference of the search
+for fewer values (`AS_GOOD`). The noise is estimated from the same equations, so
+differences are less certain: c is the share of the degrees of freedom that the set leaves.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+import math
 
 import numpy as np
+import scipy
 
-from .beam import accepted, explored, is_all_noise, is_significant, reshaped
-from .curves import Near, probabilities, Process, process_of, SIGNIFICANT, walk_beside
-from .linear import Linear, Set
+from .curves import Process, process_of, SIGNIFICANT, Walk, walk_beside
+from .linear import (
+    best_of_each, choose_shapes, extend_each, is_barred, LEVEL, Linear, Set, with_outliers)
 from .state import (
-    Candidate, candidates, fitted_state, left_open, linearised, State, with_effect, without)
+    Candidate, candidates, fitted_state, is_noise, left_open, linearised, State, with_effect,
+    without)
 from ..calibration import has_usual_gains
-from ..effects import EffectKey, included, LADDER, Model, WANDER
+from ..effects import CHANGES, EffectKey, fitted_places, included, LADDER, Model, WANDER
 from ..estimate import judge
 from ..table import Poses
+
+_LEVEL_OF_GAP = 0.05
+"""`LEVEL` of an effect that explains all of a gap. A larger one names more of the small effects of
+few poses, and more where nothing is hidden and the noise is understated."""
+
+_JUST_NOISE = 0.1
+"""Probability of a larger sum of squares, above which the rest is just the measured noise."""
+
+_LARGEST = 5
+"""Largest number of effects in a set."""
+
+_WIDTH = 4
+"""Number of sets that are extended."""
+
+AS_GOOD = 2.0
+"""Within this difference from the best score, the set with fewest values wins."""
+
+_NEARLY = 0.3
+"""Smallest share of the score of a set that a reshaped set has before its shape is fitted."""
+
+_PATIENCE = 2
+"""The search ends if the best score has not risen for this number of extensions."""
 
 _ROUNDS = 4
 """Largest number of searches, each near the model of the one before."""
@@ -39,6 +77,193 @@ _TREND = 15.0
 
 _EXACT = 0.05
 """Largest error of a predicted sum of squares, in variances, after which a search ends."""
+
+LEAST = 0.01
+"""Smallest probability of a rival."""
+
+
+def explored(linear: Linear) -> list[Set]:
+    """
+    Return the sets visited, the best score first.
+
+    The search starts from no effect, and again from all changes of V and W at once: if a stored
+    fit has absorbed an effect, only all of them beside it are better than effects that imitate it.
+
+    """
+    names = [name for name in linear.numbers_of if name in CHANGES]
+    changes = [int(linear.numbers_of[name][0]) for name in names if name not in included(names)]
+    visited: list[Set] = []
+    for start in {(), tuple(changes)}:
+        front = best_of_each(with_outliers([Set.of(linear, start)]))
+        visited += front
+        best, idle = max(chosen.score for chosen in front), 0
+        for _ in range(_LARGEST):
+            tested = (choose_shapes(new) for new in extend_each(front))
+            front = best_of_each(with_outliers(tested))[:_WIDTH]
+            if not front:
+                break
+            visited += [*front, *(fewer for new in front[:3] for fewer in new.smaller)]
+            idle = 0 if front[0].score > best else idle + 1
+            best = max(best, front[0].score)
+            if idle == _PATIENCE:
+                break
+    return best_of_each(visited)
+
+
+def reshaped(chosen: Set) -> list[Set]:
+    """
+    Return sets with one effect less and the best searched shape of another, or with its own.
+
+    Between the shapes that are tried, two effects may imitate one: an offset that changes with
+    temperature and with its rate is one that lags. An effect that was left out may also return
+    with the best shape beside the others.
+
+    """
+    blocks, fitted = chosen.linear.blocks, dict[EffectKey, list[int]]()
+    for number, block in enumerate(blocks):
+        if block.searched and fitted_places(block.entry, block.shape):
+            fitted.setdefault(block.effect, []).append(number)
+    sets = []
+    for less in chosen.smaller:
+        for effect, own in fitted.items():
+            others = less.without_effects((effect,))
+            if is_barred(blocks[own[0]], others.entries):
+                continue
+            gain, _ = others.gains(effect)
+            new = others.extended(max(own, key=lambda number: gain[number]))
+            if new.score > _NEARLY * chosen.score:
+                sets.append(new)
+    return sets
+
+
+def accepted(visited: Iterable[Set]) -> Iterator[Set]:
+    """
+    Yield the sets of `explored` whose effects are significant, the preferred one first.
+
+    The set without effects is not preferred to a better one if it leaves more than the noise.
+
+    """
+    left = list(visited)
+    while left:
+        near: list[Set] = []
+        for chosen in left:
+            if near and chosen.score < near[0].score - AS_GOOD:
+                break
+            if all(is_significant(chosen, block) for block in chosen.blocks):
+                near.append(chosen)
+        if not near:
+            return
+        best = min(near, key=lambda chosen: (
+            not chosen.blocks and leaves_gap(chosen), chosen.parameters,
+            any('new' in each.entry.needs for each in chosen.entries), -chosen.score))
+        yield best
+        left = [chosen for chosen in left if chosen is not best]
+
+
+def is_significant(chosen: Set, block: int) -> bool:
+    """
+    Return whether noise alone hardly makes an effect this good beside the others of a set.
+
+    An effect that leaves just the measured noise, where the others leave more, needs less.
+
+    """
+    left = chosen.linear.dof - chosen.parameters
+    fills_gap = (scipy.special.chdtrc(left, chosen.rss) > _JUST_NOISE
+                 and leaves_gap(chosen.without(block)))
+    return chosen.probability(block) < (_LEVEL_OF_GAP if fills_gap else LEVEL)
+
+
+def is_all_noise(chosen: Set) -> bool:
+    return is_noise(chosen.rss, chosen.linear.dof - chosen.parameters)
+
+
+def leaves_gap(chosen: Set) -> bool:
+    """Return whether the noise is known and does not explain the rest."""
+    return chosen.linear.worth > 0.0 and not is_all_noise(chosen)
+
+
+@dataclass(frozen=True)
+class Near:
+    """
+    What was chosen in the equations of all poses near a model.
+
+    The equations of `chosen` are whitened if there is a `walk`; those of `plain` are not. If no
+    walk is tried, `process` is None. `fitted` are the scores of other effects in the place of one,
+    by both names, and what is unusual costs them, where their own fit is not as good as these
+    equations predict.
+
+    """
+
+    chosen: Set
+    plain: Linear
+    walk: Walk | None
+    process: Process | None
+    fitted: Mapping[tuple[EffectKey, EffectKey], tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def beside(self) -> Set:
+        """Return what was chosen, in the equations that are not whitened."""
+        return self.chosen.within(self.plain)
+
+    @property
+    def names(self) -> tuple[EffectKey, ...]:
+        return self.chosen.effects
+
+    def block_of(self, name: EffectKey) -> int:
+        """Return the index of the block of a chosen effect."""
+        return self.chosen.blocks[self.names.index(name)]
+
+    def without(self, name: EffectKey) -> Set:
+        """Return what was chosen, without an effect."""
+        return self.chosen.without(self.block_of(name))
+
+    def score_above(self, base_rss: float) -> float:
+        """Return the score relative to a base that leaves this sum of squares."""
+        worth = self.plain.worth
+        return self.chosen.score + (worth + self.plain.dof) * math.log(
+            (worth + base_rss + 1e-300) / (worth + self.plain.base_rss + 1e-300))
+
+    @property
+    def key(self) -> tuple[frozenset[EffectKey], tuple[int, ...], bool]:
+        """Return what was chosen, apart from values and shapes."""
+        return frozenset(self.names), self.chosen.out, self.walk is not None
+
+
+def probabilities(name: EffectKey, near: Near, *, usual: bool = True) -> dict[EffectKey, float]:
+    """
+    Return the probabilities of an effect or `WANDER` and those in its place, largest first.
+
+    `usual`: effects that are far larger than in common sensors are less probable; otherwise, the
+    data alone decide.
+
+    """
+    if name != WANDER and name not in near.names:
+        return {name: 1.0}
+    whole = near.plain.worth + near.plain.dof
+    certainty = max((whole - near.chosen.parameters) / whole, LEAST)
+    back = 0.0 if usual else 1.0
+    others = near.beside if name == WANDER else near.without(name)
+    scores: dict[EffectKey, float] = {name: near.chosen.score + back * near.chosen.unusual}
+    least = 2.0 * np.log(LEAST) / certainty + scores[name] - back * others.unusual
+    for number, likely in enumerate(others.scores_beside):
+        effect = others.linear.blocks[number].effect
+        if (likely > least and effect not in near.names
+                and (effect in LADDER or name not in LADDER)):
+            larger = others.extended(number)
+            score = larger.score + back * larger.unusual - AS_GOOD * float(
+                np.sign(larger.parameters - near.chosen.parameters))
+            scores[effect] = max(score, scores.get(effect, -np.inf))
+    if name != WANDER and near.walk is None and near.process is not None:
+        scores[WANDER] = walk_beside(others, near.process).score + back * others.unusual
+    for other in scores:
+        own, unusual = near.fitted.get((name, other), (np.inf, 0.0))
+        scores[other] = min(scores[other], own + back * unusual)
+    most = max(scores.values())
+    weights = {key: float(np.exp(certainty * (score - most) / 2.0))
+               for key, score in scores.items()}
+    total = sum(weights.values())
+    ordered = sorted(weights, key=lambda key: -weights[key])
+    return {key: weights[key] / total for key in ordered}
 
 
 @dataclass(frozen=True)
@@ -75,9 +300,8 @@ class Trial:
     def fitted(self, chosen: Set, state: State, most: float = np.inf) -> State | None:
         """Return the fit of a set; None without a sound fit below `most`."""
         model = {name: part for name, part in state.model.values.items() if name in self.fixed}
-        for number, values in chosen.values.items():
-            block = chosen.linear.blocks[number]
-            model = with_effect(model, block.effect, np.concatenate([values, block.shape]))
+        for effect, values in chosen.values.items():
+            model = with_effect(model, effect, values)
         after = fitted_state(Model(model), without(self.poses_g, chosen.out), most)
         if after is None or not chosen.blocks:
             return after
@@ -244,8 +468,7 @@ def _doubtful(state: State, near: Near) -> tuple[EffectKey, EffectKey] | None:
             continue
         if not is_significant(near.chosen, near.block_of(name)):
             return name, ''
-        values = {other: part for other, part in state.model.values.items() if other != name}
-        fewer = fitted_state(Model(values), state.poses_g) if near.walk is None else None
+        fewer = state.refit_without((name,)) if near.walk is None else None
         if fewer is not None and not _lowers(state, fewer):
             return name, ''
     for name in (*near.names, *(() if near.walk is None else (WANDER,))):
@@ -263,8 +486,7 @@ def _lowers(state: State, fewer: State) -> bool:
 def _exchanged(state: State, near: Near, name: EffectKey, other: EffectKey, trial: Trial
                ) -> tuple[State, Near] | None:
     """Return the fit with another effect, if any, in the place of one, and the set near it."""
-    chosen = near.beside.instead(block for block in near.chosen.blocks
-                                 if near.plain.blocks[block].effect != name)
+    chosen = near.beside.without_effects((name,))
     if other and other != WANDER:
         chosen = chosen.extended(chosen.best_of(other))
     after = trial.fitted(chosen, state)

@@ -23,10 +23,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .curves import LEAST, nearest_effects, probabilities
+from .curves import nearest_effects
 from .linear import is_seen, Set
 from .search import Found
-from .settle import ladder_set
+from .settle import ladder_set, LEAST, probabilities
 from .state import (
     amplitudes_of, candidates, fitted_state, is_noise, linearised, State, with_effect)
 from ..calibration import ENOUGH
@@ -36,9 +36,8 @@ from ..effects import (
     unchanged, variable_of, WANDER)
 from ..estimate import Fit, kinds
 from ..geometry import ATTITUDES
-from ..statistics import rms
 from ..table import column_of, Floats, Poses
-from ..units import MG
+from ..units import MG, rms
 
 MOST_RIVALS = 3
 """Largest number of rivals of an effect that is called the explanation."""
@@ -165,7 +164,7 @@ class Stage:
 
 def verdict_of(found: Found, steps: Sequence[Step], *, refused: bool) -> tuple[Verdict, bool]:
     """Return the verdict on a search, and whether it is undecided what explains the gap."""
-    residual, _ = beside_walk(found)
+    residual, _ = found.left
     if found.final.fit.noise_known and not is_noise(float(residual @ residual), found.final.dof):
         return 'unexplained', False
     if steps and (refused or any(len(step.rivals) > MOST_RIVALS for step in steps)
@@ -200,8 +199,7 @@ def steps_of(found: Found, start: State, date: str
     titles = ('base', *(step.effect for step in steps))
     at = (*states[:1] * len(of_output), *states)  # limit and grid leave the residuals
     return steps, tuple(
-        Stage(name, state.mg_of_poses(beside_walk(found)[1] if name == WANDER
-                                      else state.fit.residual))
+        Stage(name, state.mg_of_poses(found.left[1] if name == WANDER else state.fit.residual))
         for name, state in zip(titles, at, strict=True))
 
 
@@ -216,7 +214,7 @@ def _step(name: EffectKey, before: State, after: State, found: Found, date: str)
     first_held_out = first if is_stored else before.held_out  # the stored model has not seen them
     if name == WANDER:
         first, first_held_out = before.residual, before.held_out
-        last = held_out = beside_walk(found)[1]  # it follows the poses: what it predicts counts
+        last = held_out = found.left[1]  # it follows the poses: what it predicts counts
     effect, place = entry_of(name), _place(name, before, found)
     values = found.final.model.values.get(name, np.zeros(len(effect.values)))
     spread = dict(zip(parameter_names(found.final.model.effects),
@@ -276,14 +274,6 @@ def _output_steps(found: Found) -> list[Step]:
         for name, value_name, value, before, place in causes]
 
 
-def beside_walk(found: Found) -> tuple[Floats, Floats]:
-    """Return the final residual without the walk, and the same held out."""
-    final = found.final
-    if found.walk is None:
-        return final.residual, final.held_out
-    return found.walk.residuals(Set.of(final.linear), final.fit.equations.force)
-
-
 def _place(name: EffectKey, before: State, found: Found) -> Remark:
     """Return where an effect acts, by its values in the final model."""
     final, effect = found.final, entry_of(name)
@@ -292,7 +282,7 @@ def _place(name: EffectKey, before: State, found: Found) -> Remark:
         alone = Model({name: final.model.values[name]})
         share = final.fit.equations.columns(alone) @ amplitudes_of(alone)
     else:
-        share = final.residual - beside_walk(found)[0]
+        share = final.residual - found.left[0]
     share_mg = final.mg_of_poses(share)
     if isinstance(name, EmpiricalCurve):
         return _place_of_curve(name, before, poses_g, share_mg)
@@ -457,17 +447,14 @@ def _remarks_on_effects(found: Found, steps: tuple[Step, ...]) -> Iterator[Remar
 def _constants_at_bounds(own: OwnEffect, found: Found) -> dict[str, float]:
     """Return the constants at their bounds of an own effect that would help."""
     effect, final, curve = own.entry, found.final, found.curve
-    before = final if curve is None else fitted_state(Model({
-        each: part for each, part in final.model.values.items() if each != curve.name}),
-        final.poses_g)
+    before = final if curve is None else final.refit_without((curve.name,))
     tried = () if before is None else tuple(candidates((own,), final.poses_g))
     if before is None or not tried or not effect.bounds:
         return {}
     alone = Set.of(linearised(before.fit, before.model.effects, tried))
-    grown = alone.extended(best := alone.best_of(own))
+    grown = alone.extended(alone.best_of(own))
     after = None if grown.score <= 0.0 else fitted_state(Model(with_effect(
-        before.model.values, own, np.concatenate(
-            [grown.values[best], alone.linear.blocks[best].shape]))), final.poses_g)
+        before.model.values, own, grown.values[own])), final.poses_g)
     shape = () if after is None else effect.split(after.model.values[own])[1].tolist()
     return {constant: value for constant, value, bounds in zip(
         effect.shape, shape, effect.bounds) if value in bounds}
@@ -489,9 +476,8 @@ def find_rivals(found: Found) -> list[dict[EffectKey, tuple[float, Fit]]]:
         for rival, weight in weights.items():
             if rival == WANDER or shown_name(rival) == shown_name(name) or weight <= LEAST:
                 continue
-            best = others.best_of(rival)
-            values = [others.extended(best).values[best], others.linear.blocks[best].shape]
-            model = Model(with_effect(kept, rival, np.concatenate(values)))
+            beside = others.extended(others.best_of(rival))
+            model = Model(with_effect(kept, rival, beside.values[rival]))
             state = fitted_state(model, final.poses_g)
             if state is not None:
                 fits[rival] = state.fit

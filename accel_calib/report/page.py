@@ -21,8 +21,6 @@ standard deviations follow from the covariance of the calibration.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,10 +44,9 @@ from ..findings import (
 from ..geometry import coverage
 from ..pipeline import ThermalOutcome
 from ..refinement import named_entries, Refinement
-from ..statistics import over_axes, rms
 from ..table import Floats, Poses
 from ..text import counted, milli, short, signed, with_minus
-from ..units import MG
+from ..units import MG, over_axes, rms
 
 STORED = 'calibration.yaml'
 """Name of the file of the calibration in the lines that use it, if it is not known."""

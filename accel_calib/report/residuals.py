@@ -9,8 +9,6 @@ The residual of each pose before and after a calibration, and its figures.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,10 +24,9 @@ from ..effects import (
     acting_temperature, add_history, AXES, EffectKey, entry_of, rate_at, sensor_force)
 from ..geometry import uncovered, unit
 from ..refinement import Refinement
-from ..statistics import over_axes, rms
 from ..table import column_of, Floats, Poses
 from ..text import milli, short, with_minus
-from ..units import MG
+from ..units import MG, over_axes, rms
 
 _CONTEXT = ('temperature', 'time', 'supply_voltage', 'std', 'rate')
 

@@ -47,7 +47,7 @@ from ..finding import LEVELS
 from ..findings import request_words
 from ..live import check_installed
 from ..logs import named_topics
-from ..messages.correction import output_frame
+from ..messages import output_frame
 from ..session import (
     CalibratorSettings, CallSoon, Check, COMMANDS, conditions, diagnostics, enable, Event, figures,
     Log, Mounting, progress, Result, run, Session, ShowPoses, Still, Surroundings, Task, Worker)
@@ -134,6 +134,7 @@ class Calibrator:
         self._worker = Worker(self.session.events, self._call_soon, self._show,
                               lambda: self.stream.flush())
         self._progress_at = 0.0
+        self._unseen: ShowPoses | None = None  # poses whose markers nobody has received
         self._still = node.create_publisher(Bool, '~/still', LATCHED)
         self._poses = node.create_publisher(MarkerArray, '~/poses', LATCHED)
         self._progress = node.create_publisher(DiagnosticStatus, '~/progress', LATCHED)
@@ -169,9 +170,8 @@ class Calibrator:
             return
         try:  # to serve the live page, in its own thread
             check_installed()
-            from ..live.exchange import Exchange
+            from ..live.exchange import Exchange, PERIOD
             from ..live.server import PageServer
-            from ..live.viewer import PERIOD
             page = Exchange(self.session, self._worker, self._call_soon)
             server = PageServer(page, settings.web_host, settings.web_port)
             server.start()
@@ -201,6 +201,7 @@ class Calibrator:
         self.session.tick()
         self._on_transforms()
         self._on_samples()
+        self._show_poses()
         if self._diagnostics.get_subscription_count():
             state = self.session.state
             first, *others = diagnostics(state)
@@ -241,6 +242,13 @@ class Calibrator:
         self._progress.publish(self._status(
             Check('progress', first.text, first.level), progress(now).figures()))
 
+    def _show_poses(self) -> None:
+        """Publish the markers of the poses if somebody listens: to make them takes 5 ms."""
+        new = self._unseen
+        if new is not None and self._poses.get_subscription_count():
+            self._poses.publish(pose_markers(new.up, new.asked, new.frame_id))
+            self._unseen = None
+
     def _show(self, event: Event) -> None:
         if self._page is not None:
             self._page.show_event(event)
@@ -254,8 +262,9 @@ class Calibrator:
                 log.info(words)
             case Still(still):
                 self._still.publish(Bool(data=still))
-            case ShowPoses(up, asked, frame_id):
-                self._poses.publish(pose_markers(up, asked, frame_id))
+            case ShowPoses():
+                self._unseen = event
+                self._show_poses()
                 self._show_progress()
             case Result(text):
                 self._result.publish(String(data=text))

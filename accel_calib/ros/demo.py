@@ -43,11 +43,10 @@ from .declare import LATCHED, SENSOR
 from .run import own_domain
 from ..effects import parse_effect
 from ..errors import AccelCalibError
-from ..statistics import rms
 from ..stored import read_calibration
 from ..table import Floats
 from ..text import counted
-from ..units import MG, STANDARD_GRAVITY
+from ..units import MG, rms, STANDARD_GRAVITY
 
 _POSES, _POSES_HIDDEN = 12, 16
 """Poses of the fit; more of them if the sensor hides an effect."""

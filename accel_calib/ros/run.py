@@ -36,8 +36,7 @@ import sys
 from threading import Thread
 from typing import Any
 
-from ..errors import AccelCalibError, hide_warnings, InputError, NEEDS_ROS
-from ..one_thread import use_one_thread
+from ..errors import AccelCalibError, hide_warnings, InputError, NEEDS_ROS, use_one_thread
 
 _OK, _BAD_INPUT = 0, 2
 

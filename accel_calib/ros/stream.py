@@ -31,12 +31,12 @@ from rclpy.validate_topic_name import validate_topic_name
 from sensor_msgs.msg import Imu
 
 from .declare import published_by_others, SENSOR
+from ..calibration import on_topics
 from ..errors import AccelCalibError, InputError
 from ..logs import (
     ACCELERATION, field_of, IMU_DOUBLES, joined, Layout, layout_of, LITTLE_ENDIAN, NAME_AT,
     named_topics, samples_of, THREE, topic_and_field)
-from ..messages.correction import motion_of, output_frame, Rewriter
-from ..messages.one_reading import Triple
+from ..messages import motion_of, output_frame, Rewriter, Triple
 from ..session import Around, BATCH, CalibratorSettings, columns_of, Session
 from ..table import Floats
 from ..text import some
@@ -216,14 +216,16 @@ class Stream:
         gyro, noise = sensor.gyro if settings.gyro_bias else None, (
             sensor.noise if settings.fill_covariance else None)
         bias = _NO_BIAS if gyro is None else gyro.at(state.around.temperature)
-        for output, calibration in zip(self._outputs, (sensor.applied, sensor.previewed, None)):
+        for output, calibration in zip(self._outputs, (sensor.calibration, sensor.offered, None)):
             output.listeners = output.publisher.get_subscription_count()
             made_for = layout, calibration, settings, noise is None
             if not all(map(operator.is_, made_for, output.made_for)):
-                output.made_for, output.rewriter = made_for, None if calibration is None else (
-                    Rewriter(layout, calibration, settings.gravity, output_frame(
-                        calibration, layout.frame_id, settings.output_frame_id), noise=noise,
-                        thermal=sensor.temperatures.stream(calibration.model)))
+                turned = state.applied if output is self._calibrated else (
+                    calibration and on_topics(calibration, settings.frame))
+                output.made_for, output.rewriter = made_for, None if turned is None else Rewriter(
+                    layout, turned, settings.gravity, output_frame(
+                        turned, layout.frame_id, settings.output_frame_id), noise=noise,
+                    thermal=sensor.temperatures.stream(turned.model))
             if output.rewriter is not None:
                 output.rewriter.bias = tuple(bias.tolist())
         self._listened = self._active and any(output.listeners for output in self._outputs)
@@ -274,7 +276,7 @@ class Stream:
             return
         if output.listeners:
             output.publisher.publish(corrected)
-        gravity = self._state.sensor.gravity
+        gravity = self._state.gravity
         if self._motion.listeners and gravity is not None and output is self._calibrated:
             self._motion.publisher.publish(motion_of(corrected, rewriter.layout, gravity))
 

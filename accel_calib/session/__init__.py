@@ -4,26 +4,23 @@
 """
 The calibrator without ROS: it takes samples and commands, and returns answers and events.
 
-`session` is the entry point, and `core` the state that all other modules read. `commands` contains
-what the user can ask for, and `use` their computations and what follows when the calibration or
-the poses change.
-`sensor` is what belongs to one sensor: `live_capture` captures its poses, and `pose_guide` chooses
-the next one. `stream` describes the messages. `conditions` is what is the case, and the next step,
-and `state` is what topics and pages show. `store` manages and locks files.
-`worker` runs the tasks and defines the events. `settings` defines the parameters. Imports point
-one way.
+`session` is the entry point, and `state` what all other modules read. `commands` contains what the
+user can ask for, and `use` their computations and what follows when the calibration or the poses
+change.
+`poses` captures poses and chooses the next one. `stream` describes the messages. `conditions` is
+what is the case, the next step, and how topics and pages show them. `store` manages and locks
+files. `worker` runs the tasks and defines the events. `settings` defines the parameters. Imports
+point one way.
 
 """
 
-from . import state
 from .commands import BUTTONS, COMMANDS, enable, run
-from .conditions import APART, conditions, next_step
-from .core import Surroundings
-from .sensor import title
+from .conditions import (
+    APART, Check, conditions, diagnostics, figures, next_step, Progress, progress, words_of_state)
 from .session import BATCH, Session
 from .settings import (
     CalibratorSettings, changed, columns_of, default_of, expected, parameter, Settings, WEB_PORT)
-from .state import Check, diagnostics, figures, Progress, progress, words_of_state
+from .state import Surroundings, title
 from .store import ros_home
 from .stream import Around
 from .worker import (
@@ -36,4 +33,4 @@ __all__ = ['APART', 'BATCH', 'BUTTONS', 'COMMANDS', 'WEB_PORT', 'Answer', 'Aroun
            'Step', 'Still', 'Surroundings', 'Task', 'Throttle', 'Worker',
            'WorkerProcess', 'answered', 'changed', 'columns_of', 'conditions', 'default_of',
            'diagnostics', 'enable', 'expected', 'figures', 'next_step', 'nothing', 'parameter',
-           'progress', 'ros_home', 'run', 'state', 'title', 'words_of_state']
+           'progress', 'ros_home', 'run', 'title', 'words_of_state']

@@ -22,10 +22,9 @@ import numpy as np
 
 from . import use
 from .conditions import next_words, thermometer_words
-from .core import Holder, State
-from .sensor import gyro_bias_of_rest, Sensor
+from .state import gyro_bias_of_rest, Sensor, State
 from .store import writing_advice
-from .use import adopt, change_words, Fitted, rate, show_poses
+from .use import adopt, change_words, Fitted, Holder, rate, show_poses
 from .worker import Compute, Files, nothing, Parse, Part, Task
 from ..calibration import (
     Calibration, fit_partial, level, mounting_only, plan_session, set_heading as with_heading)
@@ -188,7 +187,7 @@ def _use(session: Holder, fitted: Fitted, *, offers: bool) -> Part[str]:
     calibration, words = fitted.calibration, fitted.words
     store, mounting = session.state.files.usable(), session.state.mounting_words(calibration)
     if offers or session.state.settings.confirm:
-        session.change(sensor=session.sensor.offer(calibration, session.state.settings))
+        session.change(sensor=session.sensor.offer(calibration))
         rate(session, fitted.refinement, fitted.rating)
         session.log('info', '; '.join(filter(None, [*fitted.details, mounting])))
         return (f'{words}; published on ~/preview only: call ~/save to use and store it, or '
@@ -324,7 +323,7 @@ def load(session: Holder) -> Task:
 def undo(session: Holder) -> Task:
     """Discard the offered calibration, or return to the one before the last stored one."""
     if session.sensor.offered is not None:
-        session.change(sensor=session.sensor.offer(None, session.state.settings))
+        session.change(sensor=session.sensor.offer(None))
         session.change_sensor(fitted_poses=0)
         rate(session, None)
         return 'the calibration on ~/preview is discarded; the one in use is unchanged'

@@ -21,13 +21,12 @@ import numpy as np
 
 from .commands import fit_if_due, poses_changed
 from .conditions import APART, CONCERNS, conditions, next_step, slow_turn, thermometer_words
-from .core import Holder
-from .live_capture import Change
-from .sensor import new_sensor
+from .poses import Change
 from .settings import CalibratorSettings
+from .state import new_sensor
 from .store import SensorFiles, store_of
 from .stream import AGAIN, SILENT
-from .use import adopt, open_files, show_mounting, show_poses
+from .use import adopt, Holder, open_files, show_mounting, show_poses
 from .worker import answered, ShowPoses, Still, Task
 from ..comparison import status
 from ..findings import mounting_words
@@ -35,12 +34,12 @@ from ..logs import named_topics
 from ..table import Floats
 from ..text import counted
 
-BATCH = 0.3
+BATCH = 0.5
 """
 Interval at which messages are passed to a session [s].
 
 A batch takes several ms on a slow machine, and messages that arrive in this time wait. At 1 kHz
-and 3 batches per second, these are less than 1 % of the messages.
+and 2 batches per second, these are less than 1 % of the messages.
 
 """
 
@@ -85,8 +84,6 @@ class Session(Holder):
         """Replace the settings that can change while the node runs."""
         before = self.state.settings
         self.change(settings=settings)
-        if settings.rotate != before.rotate:
-            self.change(sensor=self.sensor.turn(settings))
         if settings.model != before.model:
             self.change_sensor(guide=self.sensor.guide.choose(None))
             show_poses(self, store=False)

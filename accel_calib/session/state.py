@@ -2,270 +2,452 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The state of a session, as its topics and pages show it.
+What a session knows: the state, and in it what belongs to one sensor.
 
-``~/progress`` has the progress of the calibration, ``~/self_test`` one check for each concern, and
-``/diagnostics`` the checks and all figures.
+All of `Sensor` is replaced when the sensor changes.
+
+Gravity is the mean corrected force of the last rest. It is subtracted while the sensor moves
+(Intan RHD2000 application note). This is accurate for motion near the orientation of that rest.
+
+Every rest is compared with 1 g (`accel_calib.comparison.drift`) as soon as it is long enough. The
+final average replaces this first comparison. A robot can stand for weeks, so each interval
+`LONG_REST` of a long rest counts as one rest.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, MISSING
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from .conditions import CONCERNS, conditions, next_step, thermometer_words
-from .core import State
-from .sensor import title
-from .stream import SILENT
-from ..comparison import status
+from .poses import Guide, LiveCapture, LONG_REST, overlap
+from .settings import CalibratorSettings, capture_settings, columns_of
+from .store import SensorFiles
+from .stream import Around, StreamStatistics, TemperatureHistory
+from ..calibration import (
+    Calibration, GyroBias, on_topics, Outside, outside, SampleNoise, with_given_mounting)
+from ..comparison import compared, Drift, rest_errors
+from ..effects import Context, OwnEffect
 from ..errors import InputError
-from ..finding import has, Level, LEVELS
-from ..logs import named_topics
-from ..messages.one_reading import Triple
-from ..pipeline import is_partial
-from ..table import column_of
-from ..text import counted
-from ..units import MG
+from ..finding import Finding
+from ..findings import mounting_words, Rating
+from ..messages import Known, OneReading, output_scale, Triple
+from ..refinement import Refinement
+from ..stillness import Dwell
+from ..table import Floats
+from ..units import FrameName, Units
+
+_SHORT_REST = 30.0
+"""Shortest remainder of a partly counted rest that counts [s]."""
+
+_NONE = np.zeros((1, 3))
+_AT_REST: Triple = (0.0, 0.0, 0.0)
+
+_LARGEST_BIAS = 0.1
+"""Largest bias of a gyro [rad/s]; MEMS gyros have up to 5 °/s."""
+
+_LARGEST_BIAS_STEP = 0.02
+"""Largest change of a stored bias from rest to rest [rad/s]."""
 
 
-def _figure(name: str, write: Callable[[Any], str], read: Callable[[str], Any],
-            default: Any = MISSING) -> Any:
-    """Return a field with the name of its figure, and what writes and reads its value."""
-    return field(default=default, metadata={'name': name, 'write': write, 'read': read})
-
-
-_VECTOR = (lambda parts: ' '.join(f'{part:.4f}' for part in parts),
-           lambda text: tuple(map(float, text.split())))
-"""What writes and reads the components of a vector."""
-
-
-@dataclass(frozen=True)
-class Progress:
+@dataclass(frozen=True, eq=False)
+class Sensor:
     """
-    The progress of a calibration, for the topic ``~/progress``.
+    The poses, the plan, the calibration, its drift, and the last rest of one sensor.
+
+    What streams is followed in `live` and `temperatures`. All else changes only with another
+    `Sensor`, which the methods return. Two of them are of the same sensor if they have the same
+    `live`.
 
     Parameters
     ----------
-    still : bool
-        Whether the sensor is still.
-    stillness : float
-        Standard deviation of the last messages, relative to the largest of a still sensor; NaN: no
-        messages.
-    dwell, min_dwell : float
-        Length of the ongoing rest, and shortest rest that becomes a pose [s].
-    poses, total : int
-        Number of poses, and about how many there will be.
-    coverage : float
-        Share of the sphere within 45° of a pose.
-    accuracy : float
-        Expected error of |a| after a fit now [g]; infinite if the poses do not determine it, NaN
-        if the noise is not known.
-    step : str
-        Kind of the next step, one of `accel_calib.finding.STEPS`; empty before it is known.
-    advice : str
-        The next step in words.
-    command : str
-        Name of the service for it; empty if there is none.
-    direction : tuple of float
-        Direction to point up, a unit vector in the sensor axes; empty: none.
-    up : tuple of float
-        Direction of the newest raw reading, a unit vector in the sensor axes; empty: not known.
-    length, corrected : float
-        Raw and corrected |a| of the newest message [g]; the correction is the offered one while a
-        calibration waits for ~/save. NaN: not known.
-    temperature : float
-        Temperature [°C]; NaN: not known.
+    live : LiveCapture
+        The poses.
+    guide : Guide
+        The next pose.
+    temperatures : TemperatureHistory
+        What the effects of temperature need.
+    calibration : Calibration or None
+        The calibration in use.
+    offered : Calibration or None
+        A calibration that waits for ~/save or ~/undo.
+    rating, refinement : Rating, Refinement or None
+        Rating of the `present` calibration, None while it is not known; and where it is from.
+    unsaved : bool
+        Whether the calibration in use could not be stored.
+    changes : int
+        Number of changes of the calibration in use or offered.
+    fitted_poses : int
+        Number of poses of the last fit; 0 if more poses are asked for.
+    auto_fit_waits : bool
+        Whether poses wait for an automatic fit.
+    refusal : str
+        Why the last automatic fit was refused; empty if it was not.
+    owners : set of str
+        Sensors that the stored files name.
+    drift : Drift or None
+        State of the drift monitor; None without a calibration.
+    rest : Dwell or None
+        The last rest.
+    past, counted : Drift, Dwell or None
+        State of the drift monitor without the ongoing rest, and what it has of the last one.
 
     """
 
-    still: bool = _figure('still', lambda still: str(still).lower(),
-                          {'true': True, 'false': False}.__getitem__)
-    stillness: float = _figure('stillness [1: limit]', '{:.3g}'.format, float)
-    dwell: float = _figure('dwell [s]', '{:.1f}'.format, float)
-    min_dwell: float = _figure('min_dwell [s]', '{:g}'.format, float)
-    poses: int = _figure('poses', str, int)
-    total: int = _figure('poses in all, about', str, int)
-    coverage: float = _figure('coverage', '{:.3f}'.format, float)
-    accuracy: float = _figure('expected accuracy [mg]', lambda error: f'{error * MG:.3g}',
-                              lambda text: float(text) / MG)
-    step: str = _figure('step', str, str)
-    advice: str = _figure('next', str, str)
-    command: str = _figure('service', str, str)
-    direction: tuple[float, ...] = _figure('next direction', *_VECTOR)
-    up: tuple[float, ...] = _figure('up', *_VECTOR, default=())
-    length: float = _figure('|a| [g]', '{:.5f}'.format, float, default=math.nan)
-    corrected: float = _figure('|a| corrected [g]', '{:.5f}'.format, float, default=math.nan)
-    temperature: float = _figure('temperature [°C]', '{:.2f}'.format, float, default=math.nan)
+    live: LiveCapture
+    guide: Guide = field(default_factory=Guide)
+    temperatures: TemperatureHistory = field(default_factory=TemperatureHistory)
+    calibration: Calibration | None = None
+    offered: Calibration | None = None
+    rating: Rating | None = None
+    refinement: Refinement | None = None
+    unsaved: bool = False
+    changes: int = 0
+    fitted_poses: int = 0
+    auto_fit_waits: bool = False
+    refusal: str = ''
+    owners: frozenset[str] = frozenset()
+    drift: Drift | None = None
+    rest: Dwell | None = None
+    past: Drift | None = None
+    counted: Dwell | None = None
 
-    def figures(self) -> Iterator[tuple[str, str]]:
-        """Yield names and values."""
-        for each in fields(self):
-            yield each.metadata['name'], each.metadata['write'](getattr(self, each.name))
+    @property
+    def present(self) -> Calibration | None:
+        """Return the calibration that a command starts from: the offered one, or that in use."""
+        return self.offered or self.calibration
 
-    @classmethod
-    def from_figures(cls, figures: Mapping[str, str]) -> Progress:
+    def offer(self, calibration: Calibration | None) -> Sensor:
+        """Publish this calibration on ~/preview only; None: discard the offered one."""
+        return replace(self, offered=calibration, changes=self.changes + 1)
+
+    def adopt(self, calibration: Calibration | None) -> Sensor:
+        """Use this calibration; the drift monitor restarts unless only the mounting differs."""
+        before, past, counted = self.calibration, self.past, self.counted
+        only_levelled = (
+            before is not None and calibration is not None
+            and before.model.effects == calibration.model.effects
+            and np.array_equal(before.model.vector, calibration.model.vector)
+            and np.array_equal(before.covariance, calibration.covariance)
+            and not np.array_equal(before.model.rotation, calibration.model.rotation))
+        if not only_levelled:
+            past, counted = None if calibration is None else Drift(calibration), self.rest
+        self.temperatures.followed.clear()  # but for models that are asked for from now on
+        return replace(self.offer(None), calibration=calibration, unsaved=False, drift=past,
+                       past=past, counted=counted)
+
+    @property
+    def gyro(self) -> GyroBias | None:
         """
-        Return the progress with these figures, as `figures` yields them; ignore others.
+        Bias of the gyro: of the last rest if it agrees with the stored one, or the stored one.
 
-        InputError if a figure is missing or cannot be read.
+        A platform that turns steadily is still for the accelerometer. A large change of the rate
+        is therefore not a bias.
 
         """
-        found = {}
-        for each in fields(cls):
-            name = each.metadata['name']
-            try:
-                found[each.name] = each.metadata['read'](figures[name])
-            except (KeyError, ValueError) as err:
-                what = f'{name}: {figures[name]}' if name in figures else f'no figure {name}'
-                raise InputError(
-                    f'the progress of the node has {what}, expected the figures of this version',
-                    'install the same version of accel_calib on both machines') from err
-        return cls(**found)
+        stored = None if self.calibration is None else self.calibration.gyro
+        now = None if self.rest is None else gyro_bias_of_rest(self.rest)
+        if now is None:
+            return stored
+        if stored is None:
+            return now
+        step = np.abs(now.bias - stored.at(now.temperature))
+        return now if np.all(step < _LARGEST_BIAS_STEP) else stored
+
+    @property
+    def noise(self) -> SampleNoise | None:
+        """Noise of the samples: that of the calibration, or otherwise of the last rest."""
+        if self.calibration is not None and self.calibration.noise is not None:
+            return self.calibration.noise
+        return None if self.rest is None else SampleNoise(self.rest.std, self.rest.rate_std)
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether the sensor has changed since the calibration."""
+        return self.drift is not None and self.drift.change is not None
+
+    def update(self, rest: Dwell, least: float, *, ended: bool = False) -> Sensor:
+        """
+        Compare a rest with 1 g: the ongoing one, or one that has `ended`.
+
+        `least` is the smallest change to report [g].
+
+        """
+        past, counted, part = self.past, self.counted, self._uncounted(rest)
+        if ended:
+            past, counted = self._with(rest, least), rest
+        elif part is not None and part.end - part.start >= LONG_REST:  # a slow change is no noise
+            past, counted = self._with(rest, least), replace(
+                rest, std=part.std, count=part.count / part.samples * rest.samples)
+        latest = self.rest if ended else rest
+        found = past if latest is None else replace(
+            self, past=past, counted=counted)._with(latest, least)
+        if found is not None and past is not None and found.change and not past.change:
+            # What was reported during a rest ends by the rule of `drift`, not with the rest.
+            past = replace(past, change=found.change, since=found.since)
+        return replace(self, rest=latest, drift=found, past=past, counted=counted)
+
+    def _uncounted(self, rest: Dwell) -> Dwell | None:
+        """Return the part of a rest that was not counted yet, or None if it is too short."""
+        before = self.counted
+        if before is None or not overlap(before, rest) or rest.samples < before.samples:
+            return rest
+        is_longer = rest.end - before.end >= _SHORT_REST and rest.samples > before.samples
+        return rest_after(before, rest) if is_longer else None
+
+    def _with(self, rest: Dwell, least: float) -> Drift | None:
+        """Return the state of the monitor after what was not counted yet of a rest."""
+        part = self._uncounted(rest)
+        context = None if part is None else self.known_context(part)
+        if self.past is None or self.calibration is None or part is None or context is None:
+            return self.past
+        noise = part.std[np.newaxis] / math.sqrt(part.count)
+        found = rest_errors(self.calibration, part.mean[np.newaxis], noise, context)
+        return compared(self.past, found[0], least)
+
+    def known_context(self, rest: Dwell) -> Context | None:
+        """Return the context of a rest, or None if the calibration needs more context."""
+        if self.calibration is None:
+            return None
+        context = self.context_of(rest, self.calibration)
+        known = all(key in context for key in self.calibration.model.needs)
+        return context if known else None
+
+    def context_of(self, rest: Dwell, calibration: Calibration) -> Context:
+        """Return the context of a rest as one row, without a previous pose."""
+        neutral = {key: np.array([value]) for key, value in calibration.model.neutral.items()}
+        known = {key: np.array([value]) for key, value in rest.context.items()}
+        return {**neutral, 'previous': _NONE, 'rate': _NONE, **known,
+                'time': np.array([rest.time]), 'std': calibration.units.to_g(rest.std)[np.newaxis],
+                **self.temperatures.during(calibration.model, rest.start, rest.end)}
+
+    def limits_left(self, known: Mapping[str, float]) -> dict[str, Outside]:
+        """
+        Return the quantities that are outside of the range of the calibration now.
+
+        The time leaves its range for ever, and the last value holds: no pose can be taken there.
+
+        """
+        if self.calibration is None:
+            return {}
+        now = {key: np.array([value]) for key, value in {
+            **known, 'std': np.zeros(3),
+            **self.temperatures.columns_of(self.calibration.model)}.items()}
+        return {key: each for key, each in outside(self.calibration, now).items()
+                if each.count and key != 'time'}
+
+    def force_of(self, reading: Triple, known: Known) -> Triple | None:
+        """Return the force of a reading by the `present` calibration [g]; None: not known."""
+        calibration, prepared = self.present, self._prepared
+        if calibration is None or prepared is None:
+            return None
+        context = {**calibration.model.neutral, 'std': _AT_REST, 'previous': _AT_REST,
+                   'rate': _AT_REST, **self.temperatures.columns_of(calibration.model), **known}
+        try:
+            return prepared.at(context).correct(*reading)
+        except InputError:
+            return None  # a quantity is not known yet, or the reading is out of range
+
+    @cached_property
+    def _prepared(self) -> OneReading | None:
+        """Return what corrects one reading by the `present` calibration."""
+        return None if self.present is None else OneReading(
+            self.present, 1.0 / self.present.force_per_g)
 
 
-def progress(state: State, reading: Triple | None = None) -> Progress:
-    """Return the progress; `reading` is the newest one, by default the last that was pushed."""
-    sensor, statistics = state.sensor, state.statistics
-    plan, silent, native = sensor.guide.plan, statistics.age > SILENT, state.units.is_native
-    step, rating = next_step(state), sensor.rating
-    if reading is None and statistics.newest is not None:
-        reading = tuple(statistics.newest.tolist())
-    up: tuple[float, ...] = ()
-    length = corrected = math.nan
-    if reading is not None and not silent:
-        along, force = np.array(reading), sensor.force_of(reading, state.context)
-        corrected = math.nan if force is None else math.hypot(*force)
-        if native and sensor.present is not None and force is not None:
-            along = sensor.present.rotation @ force
-        elif native:  # the direction is known only with the zero
-            along = along - plan.zero if plan is not None and plan.zero else along * math.nan
-        size = math.hypot(*along)
-        up = tuple((along / size).tolist()) if 0.0 < size < math.inf else ()
-        length = math.nan if native else size / state.units.per_g
-    # NaN if it is not known, or not the noise alone.
-    noisy = rating is not None and has(rating.findings, 'beyond_noise')
-    return Progress(
-        still=state.still and not silent,
-        stillness=math.nan if silent else statistics.spread / sensor.live.detector.threshold,
-        dwell=statistics.stamp - state.still_since if state.still else 0.0,
-        min_dwell=state.settings.min_dwell, poses=sensor.guide.poses,
-        total=0 if plan is None else plan.asked.total,
-        coverage=0.0 if plan is None else plan.coverage,
-        accuracy=math.nan if plan is None or noisy else plan.asked.error * plan.noise_g,
-        step=step.kind, advice=step.text, command=step.command, direction=step.direction,
-        up=up, length=length, corrected=corrected, temperature=state.around.temperature)
+def new_sensor(settings: CalibratorSettings, units: Units) -> Sensor:
+    """Return a sensor without poses and calibration."""
+    return Sensor(LiveCapture(capture_settings(settings), units, columns_of(settings)))
 
 
-class Check(NamedTuple):
-    """The result of a check: what is right or wrong, and its level as of a finding."""
-
-    concern: str
-    words: str
-    level: Level
-
-
-def diagnostics(state: State) -> list[Check]:
-    """Return first the state, with the most severe finding, and then a check for each concern."""
-    sensor, drift, found, all_found = state.sensor, state.sensor.drift, [], conditions(state)
-    fine = {'stream': f'{state.statistics.rate:.1f} Hz on {state.topic}',
-            'calibration': '' if sensor.calibration is None else title(sensor.calibration),
-            'drift': 'no calibration yet' if drift is None else status(drift),
-            'storage': state.files.path}
-    if sensor.calibration is None and sensor.offered is None:
-        count = counted(len(sensor.live.poses()), 'pose')
-        fine['calibration'] = f'no calibration yet, captured {count}'
-    for concern, words in fine.items():
-        wrong = [each for each in all_found if each.level != 'GOOD'
-                 and CONCERNS.get(each.kind, 'stream') == concern]
-        said = list(dict.fromkeys(each.text for each in wrong))
-        if all(each.kind in ('step', 'switched_off') and each.level != 'BAD' for each in wrong):
-            said[:1] = [': '.join(filter(None, [words, *said[:1]]))]
-        level = max((each.level for each in wrong), key=LEVELS.index, default=LEVELS[0])
-        found.append(Check(concern, '; '.join(said), level))
-    worst = max(all_found, key=lambda each: LEVELS.index(each.level))
-    concern = CONCERNS.get(worst.kind, 'stream')
-    words = words_of_state(state) if worst.level == 'GOOD' else next(
-        each.words for each in found if each.concern == concern)
-    return [Check('state', words, worst.level), *found]
+def gyro_bias_of_rest(rest: Dwell) -> GyroBias | None:
+    """Return the bias of the gyro from one rest; None without a plausible angular rate."""
+    rate = rest.context.get('rate')
+    if rate is None or not np.all(np.isfinite(rest.rate_std)) or np.any(
+            np.abs(rate) > _LARGEST_BIAS):
+        return None
+    temperature = float(np.asarray(rest.context.get('temperature', math.nan)))
+    known = () if math.isnan(temperature) else (temperature, temperature)
+    return GyroBias(np.asarray(rate, float), rest.rate_std / math.sqrt(rest.count), rests=1,
+                    temperature=temperature, slope=np.zeros(3), temperatures=known)
 
 
-def words_of_state(state: State) -> str:
-    """Return whether messages are corrected, and why not."""
-    calibration = state.sensor.calibration
-    return next(words for holds, words in (
-        (state.files.problem, 'another node uses the files, nothing is published'),
-        (not state.enabled, 'correction switched off, raw messages are published'),
-        (state.sensor.offered is not None, 'a new calibration waits for ~/save or ~/undo'),
-        (calibration is not None and is_partial(calibration),
-         'correcting, with a calibration of a part of the orientations'),
-        (calibration is not None, 'correcting'),
-        (not state.statistics.messages, 'waiting for the first message'),
-        (state.settings.passthrough, 'no calibration, raw messages are published'),
-        (True, 'no calibration, nothing is published')) if holds)
+def rest_after(part: Dwell, whole: Dwell) -> Dwell:
+    """Return the remainder of a rest after a part of it, with the noise of the part."""
+    samples = whole.samples - part.samples
+    share = samples / whole.samples
+
+    def mean(before: Any, all_of_it: Any) -> Any:
+        return (all_of_it - (1.0 - share) * before) / share
+
+    context = {key: mean(part.context.get(key, value), value)
+               for key, value in whole.context.items()}
+    return replace(whole, start=part.end, time=mean(part.time, whole.time), samples=samples,
+                   mean=mean(part.mean, whole.mean), context=context, std=part.std,
+                   count=part.count / part.samples * samples)
 
 
-def figures(state: State) -> Iterator[tuple[str, str]]:
-    """Yield names and values for the diagnostics."""
-    sensor, counts, warm = state.sensor, state.statistics, state.around.temperature
-    gravity, rest, drift, live = sensor.gravity, sensor.rest, sensor.drift, sensor.live
-    yield 'state', words_of_state(state)
-    yield 'sensor', state.name
-    yield 'calibration', 'none' if sensor.calibration is None else title(sensor.calibration)
-    yield 'calibration file', state.files.path
-    yield 'rate [Hz]', f'{counts.rate:.1f}'
-    yield 'messages', str(counts.messages)
-    yield 'readings not finite', str(counts.dropped['not_finite'])
-    yield 'messages of another sensor', str(counts.dropped['foreign'])
-    yield 'corrected messages not plausible', str(counts.dropped['implausible'])
-    yield 'residual |a| - 1 g at last rest [mg]', _number(math.nan if gravity is None else (
-        float(np.linalg.norm(gravity)) / state.settings.gravity - 1.0) * MG)
-    if drift is not None:
-        yield 'drift since calibration [mg]', _number(drift.error * MG)
-        yield 'stated uncertainty at last rest [mg]', _number(drift.stated * MG)
-        yield 'rests since calibration', str(drift.count)
-        yield 'rests since it changed', str(drift.lasted)
-        if drift.change is not None:
-            yield 'changed by [mg]', _number(drift.change.error * MG)
-        if drift.temperatures:
-            low, high = drift.temperatures
-            yield 'temperature when calibrated [°C]', f'{low:.1f} to {high:.1f}'
-    yield 'since last rest [s]', _number(math.nan if rest is None else (
-        0.0 if live.still else max(0.0, counts.stamp - rest.end)))
-    poses, breaks = live.poses(), live.detector.interruptions
-    yield 'poses captured', str(len(poses))
-    yield 'poses doubtful', str(int(np.sum(poses['doubtful'])) if 'doubtful' in poses else 0)
-    yield 'next', next_step(state).text or 'turn the sensor'
-    yield 'interruptions of the clock', str(len(breaks))
-    yield 'last interruption', (
-        f'{breaks[-1].kind}, {breaks[-1].seconds:.2f} s' if breaks else 'none')
-    yield 'zeros or frozen readings [s]', (
-        f'{sum(each.end - each.start for each in live.detector.missing):.1f}')
-    yield 'temperature [°C]', (_number(warm) if math.isfinite(warm)
-                               else f'not known: {thermometer_words(state)}')
-    for column in named_topics(state.settings.context):
-        unit = column_of(column).unit
-        if column != 'temperature':
-            yield f'{column} [{unit}]' if unit else column, _number(
-                state.around.values.get(column, math.nan))
-    yield 'still below [m/s² or native]', f'{live.detector.threshold:.4g}'
-    yield 'mounting', state.mounting_words(sensor.calibration) or 'not known'
-    gyro, noise = sensor.gyro, sensor.noise
-    if gyro is not None:
-        yield 'gyro bias [rad/s]', _vector(gyro.at(warm))
-        yield 'gyro bias, standard deviation [rad/s]', _vector(gyro.sd)
-    if noise is not None:
-        yield 'noise of acceleration [m/s² or native]', _vector(noise.force)
-        yield 'noise of angular velocity [rad/s]', _vector(noise.rate)
+def title(calibration: Calibration) -> str:
+    """Return a short description of a calibration."""
+    return (f'model {calibration.name} of {calibration.date or "unknown date"}, '
+            f'{calibration.quality.rms_after_mg:.3f} mg, '
+            f'{"levelled" if calibration.is_levelled else "not levelled"}')
 
 
-def _vector(values: Iterable[float]) -> str:
-    return ', '.join(f'{value:.4g}' for value in values)
+# ----------------------------------------------------------------------------- the state
+
+@dataclass(frozen=True)
+class Surroundings:
+    """
+    What ROS, or the program behind a page, knows of the samples.
+
+    Parameters
+    ----------
+    publishers : tuple of str or None
+        Names of the nodes that publish the messages; None: the samples come from a board.
+    imus, thermometers : tuple of str
+        Topics with messages of Imus and of temperatures that other nodes publish.
+    mismatches : tuple of str
+        Publishers and subscribers with another QoS, which exchange no messages with this node.
+    missing : mapping of str to str
+        Why a column of the parameter `context` does not arrive.
+    ended : bool
+        Whether no more samples can come, because a recording has ended.
+
+    """
+
+    publishers: tuple[str, ...] | None = ()
+    imus: tuple[str, ...] = ()
+    thermometers: tuple[str, ...] = ()
+    mismatches: tuple[str, ...] = ()
+    missing: Mapping[str, str] = field(default_factory=dict)
+    ended: bool = False
 
 
-def _number(value: float) -> str:
-    return f'{value:.3f}' if math.isfinite(value) else 'not known'
+@dataclass(frozen=True, eq=False)
+class State:
+    """
+    The state of the calibrator of one sensor.
+
+    The stream is counted in `statistics` and `around`. All else changes only with another state.
+
+    Parameters
+    ----------
+    settings : CalibratorSettings
+        The parameters.
+    topic : str
+        Topic of the messages, with namespace.
+    units : Units
+        Unit of the readings.
+    sensor : Sensor
+        What belongs to the sensor; another sensor replaces all of it.
+    statistics, around : StreamStatistics, Around
+        The messages, and what is known beside them.
+    files : SensorFiles
+        The files of the sensor, and their lock.
+    own : tuple of OwnEffect
+        The effects of the user.
+    given : (3, 3) array or None
+        Mounting ΔR that is known from elsewhere.
+    frame_id : str or None
+        That of the messages; None before the first one.
+    problem : str
+        Why the stored calibration, or the files, cannot be used.
+    is_refused : bool
+        Whether the stored calibration is sound, but not for this node as it was started.
+    refusals : mapping of str to (str, tuple)
+        What to do about each refused command, or ``poses`` for a fit, and its situation then.
+    found : tuple of Finding
+        What was found in the samples before they come here.
+    enabled : bool
+        Whether messages are corrected.
+    still : bool
+        Whether the sensor is still.
+    still_since : float
+        Stamp since when it is [s].
+    surroundings : Surroundings
+        What is known of the graph of ROS, or of a board.
+    computing : int
+        Number of fits and refinements that are running.
+
+    """
+
+    settings: CalibratorSettings
+    topic: str
+    units: Units
+    sensor: Sensor
+    statistics: StreamStatistics
+    around: Around
+    files: SensorFiles = SensorFiles()
+    own: tuple[OwnEffect, ...] = ()
+    given: Floats | None = None
+    frame_id: str | None = None
+    problem: str = ''
+    is_refused: bool = False
+    refusals: Mapping[str, tuple[str, tuple[object, ...]]] = field(default_factory=dict)
+    found: tuple[Finding, ...] = ()
+    enabled: bool = True
+    still: bool = False
+    still_since: float = math.nan
+    surroundings: Surroundings = Surroundings()
+    computing: int = 0
+
+    @property
+    def name(self) -> str:
+        """Name of the sensor; empty if not known yet."""
+        return self.settings.sensor or self.frame_id or ''
+
+    @property
+    def frame(self) -> FrameName:
+        """Levelled frame of calibrations; messages in ned are those of ros, turned."""
+        return 'ros' if self.settings.frame == 'ned' else self.settings.frame
+
+    @property
+    def context(self) -> dict[str, float]:
+        """Present time [s], if known, and the context as a calibration uses it."""
+        stamp = self.statistics.stamp
+        return {**self.around.filled, **({} if math.isnan(stamp) else {'time': stamp})}
+
+    @cached_property
+    def applied(self) -> Calibration | None:
+        """Return the calibration in use in the frame of messages, or without the mounting."""
+        calibration = self.sensor.calibration
+        if calibration is None or not self.settings.rotate:
+            return calibration and calibration.in_sensor_frame
+        return on_topics(calibration, self.settings.frame)
+
+    @cached_property
+    def gravity(self) -> Floats | None:
+        """Corrected force of the last rest, (3,) [m/s²]; None if it cannot be corrected."""
+        rest, applied = self.sensor.rest, self.applied
+        context = None if rest is None else self.sensor.known_context(rest)
+        if rest is None or applied is None or context is None:
+            return None
+        force = applied.correct(rest.mean[np.newaxis], context)[0]
+        return force * output_scale(applied, self.settings.gravity)
+
+    def refusal_of(self, command: str) -> str:
+        """Return what to do about a command that would be refused again; empty if it may work."""
+        words, situation = self.refusals.get(command, ('', None))
+        return words if situation and situation == self.situation_of(command) else ''
+
+    def situation_of(self, command: str) -> tuple[object, ...]:
+        """Return what a refusal of a command depends on."""
+        live, rests = self.sensor.live, command in ('set_level', 'calibrate_at_rest')
+        return (live, len(live.poses()), self.sensor.changes,
+                rests and live.detector.current() is None)
+
+    def with_given(self, calibration: Calibration) -> Calibration:
+        """Return a calibration with the given mounting, if there is one."""
+        return calibration if self.given is None else with_given_mounting(calibration, self.given)
+
+    def mounting_words(self, calibration: Calibration | None) -> str:
+        """Return the mounting of a calibration as one line; empty if it is not known."""
+        if calibration is None or not calibration.is_levelled:
+            return ''
+        return mounting_words(calibration.rotation, self.frame_id or '', self.settings.base_frame)

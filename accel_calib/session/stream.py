@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .live_capture import LONG_REST
+from .poses import LONG_REST
 from ..effects import Context, Model, thermal_stream, ThermalStream
 from ..table import Floats
 from ..units import Units

@@ -9,33 +9,37 @@ files take time, so they are tasks, which are added to the events.
 
 """
 
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 import json
 import math
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
 from .conditions import next_step
-from .core import Holder
-from .sensor import Sensor, title
 from .settings import CalibratorSettings
+from .state import new_sensor, Sensor, State, title
 from .store import Store, tidied, unusable, writing_advice
-from .stream import AGAIN
-from .worker import Compute, Files, Mounting, nothing, Parse, Result, Severity, ShowPoses, Task
+from .stream import AGAIN, Around, StreamStatistics
+from .worker import (
+    Compute, Event, Files, Log, Mounting, nothing, Parse, Result, Severity, ShowPoses, Task,
+    Throttle)
 from ..calibration import Calibration, in_frame, on_topics, plan_session
-from ..effects import OwnEffect, shown_name
-from ..errors import DamagedCalibrationError, StoredCalibrationError
+from ..effects import effects_of_file, OwnEffect, shown_name
+from ..errors import DamagedCalibrationError, InputError, StoredCalibrationError
 from ..findings import (
     calibration_json, mounting_figures, outlook, rate as rating_of, Rating, rating_json,
     refinement_json, rival_words, verdict_words)
-from ..geometry import angle_of, spread_directions
+from ..geometry import angle_of, rotation_from_rpy, spread_directions
 from ..pipeline import calibrated, is_partial, is_refined, Plan
 from ..refinement import refine as refine_poses, Refinement
 from ..stillness import Dwell
 from ..table import CONTEXT, is_quantity, Poses
 from ..text import counted, listed, now, plain
-from ..units import MG, Units
+from ..units import MG, Units, units_of
 
 _DIRECTIONS = 100
 """Number of directions over which two calibrations are compared."""
@@ -168,13 +172,79 @@ def differs(before: Calibration | None, after: Calibration) -> bool:
 
 # ----------------------------------------------------------------------------- use
 
+class Holder:
+    """
+    The present state of a session, and what it reports; parameters and errors as `Session`.
+
+    Attributes
+    ----------
+    state : State
+        The present state; another one after each change.
+    events : deque of Event
+        What the session reports, in order; whoever shows it removes it.
+    throttle : Throttle
+        When log lines and automatic fits are due again.
+
+    """
+
+    def __init__(self, settings: CalibratorSettings, topic: str, clock: Callable[[], float],
+                 **known: Any) -> None:
+        if any(settings.mounting_rpy) and settings.base_frame:
+            raise InputError('both mounting_rpy and base_frame are set, expected one of them',
+                             'remove one')
+        if settings.publish_tf and settings.output_frame_id and (
+                settings.output_frame_id == settings.base_frame):
+            raise InputError(f'publish_tf would make {settings.base_frame!r}, the frame of the '
+                             'robot, a child of the frame of the sensor',
+                             'set publish_tf to false, or choose another output_frame_id')
+        try:
+            own = effects_of_file(Path(settings.also).expanduser()) if settings.also else ()
+        except (OSError, RuntimeError) as error:
+            raise InputError(f'also is {settings.also}, which cannot be read: {error}',
+                             'correct the parameter') from error
+        units, rpy = units_of(settings.units, settings.gravity), settings.mounting_rpy
+        self.state = replace(State(
+            settings, topic, units, sensor=new_sensor(settings, units),
+            statistics=StreamStatistics(clock), around=Around(clock), own=own,
+            given=rotation_from_rpy(*rpy).T if any(rpy) else None), **known)
+        self.events, self.throttle = deque[Event](), Throttle(clock)
+
+    @property
+    def sensor(self) -> Sensor:
+        """Return the present sensor."""
+        return self.state.sensor
+
+    def change(self, **changes: Any) -> None:
+        """Go on with a state in which these fields are changed."""
+        self.state = replace(self.state, **changes)
+
+    def change_sensor(self, **changes: Any) -> None:
+        """Go on with a sensor in which these fields are changed."""
+        self.change(sensor=replace(self.sensor, **changes))
+
+    def refuse(self, command: str, words: str) -> None:
+        """Note that a command is refused, or ``poses`` for a fit, and what to do."""
+        refused = words, self.state.situation_of(command)
+        self.change(refusals={**self.state.refusals, command: refused})
+
+    def drop(self, kind: str, severity: Severity, words: str, count: int = 1) -> None:
+        """Count dropped messages of a kind, and log why, at most once in `AGAIN`."""
+        self.state.statistics.drop(kind, count)
+        self.log(severity, words, kind, AGAIN)
+
+    def log(self, severity: Severity, words: str, kind: str = '', once_in: float = 0.0) -> None:
+        """Add a log line to the events; of a kind, if it has one, at most one in `once_in` [s]."""
+        if words and (not kind or self.throttle.passes(kind, once_in)):
+            self.events.append(Log(severity, words))
+
+
 def adopt(session: Holder, calibration: Calibration | None, refinement: Refinement | None = None,
           rating: Rating | None = None) -> None:
     """Correct with this calibration, and with the given mounting if there is one."""
     session.change(problem='', is_refused=False)
     state, settings = session.state, session.state.settings
     if calibration is None:
-        session.change(sensor=session.sensor.adopt(None, settings))
+        session.change(sensor=session.sensor.adopt(None))
         state.around.assume({})
         rate(session, None)
         return
@@ -187,7 +257,7 @@ def adopt(session: Holder, calibration: Calibration | None, refinement: Refineme
     if levelled and not np.allclose(stored.rotation[:, 2], calibration.rotation[:, 2]):
         session.log('warning', 'the stored mounting differs from the given one by more than 10° '
                     'of tilt: the given mounting is used; call ~/set_level with the robot level')
-    session.change(sensor=session.sensor.adopt(calibration, settings))
+    session.change(sensor=session.sensor.adopt(calibration))
     state.around.assume({key: value for key, value in calibration.typical.items()
                          if key in CONTEXT or is_quantity(key)})
     rate(session, refinement, rating)

@@ -41,20 +41,18 @@ from importlib import import_module
 import math
 import os
 import pickle
-from queue import SimpleQueue
-from select import select
+from select import poll, select
 import signal
 import subprocess
 import sys
 from threading import RLock, Thread
 from time import monotonic
 from traceback import format_exc
-from typing import Any, BinaryIO, cast, Literal, TypeVar
+from typing import Any, cast, Literal, NamedTuple, TypeVar
 
 from .store import writing_advice
 from ..calibration import NextPose
-from ..errors import AccelCalibError, InputError
-from ..one_thread import ONE_THREAD
+from ..errors import AccelCalibError, InputError, ONE_THREAD
 from ..table import Floats
 
 Found = TypeVar('Found')
@@ -176,30 +174,28 @@ def main() -> None:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     answers = os.fdopen(os.dup(sys.stdout.fileno()), 'wb')
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # printed text must not mix with answers
-    calls: SimpleQueue[Any] = SimpleQueue()
-    Thread(target=_read, args=(sys.stdin.buffer, calls), daemon=True).start()
+    Thread(target=_end_with_the_node, daemon=True).start()
     for name in _IMPORTED:
         import_module(name)
     try:
         while True:
-            function, given = calls.get()
+            function, given = pickle.load(sys.stdin.buffer)
             try:
                 answer = True, function(*given)
             except Exception as error:  # raised again in the node, by `call`
                 answer = False, error
             answers.write(pickle.dumps(answer))
             answers.flush()
-    except BrokenPipeError:  # the node has ended
+    except (BrokenPipeError, EOFError, pickle.UnpicklingError):  # the node has ended
         os._exit(0)
 
 
-def _read(stream: BinaryIO, calls: SimpleQueue[Any]) -> None:
-    """Read calls; end the process when the node ends, even during a computation."""
-    try:
-        while True:
-            calls.put(pickle.load(stream))
-    finally:
-        os._exit(0)
+def _end_with_the_node() -> None:
+    """End the process when its standard input is closed, even during a computation."""
+    closed = poll()
+    closed.register(sys.stdin.fileno(), 0)  # no other event than the end of all writers
+    closed.poll()
+    os._exit(0)
 
 
 def nothing() -> None:
@@ -270,23 +266,20 @@ Part = Generator[Step, Any, Found]
 Severity = Literal['info', 'warning', 'error']
 
 
-@dataclass(frozen=True)
-class Log:
+class Log(NamedTuple):
     """A log line."""
 
     severity: Severity
     words: str
 
 
-@dataclass(frozen=True)
-class Still:
+class Still(NamedTuple):
     """A change of whether the sensor is still."""
 
     still: bool
 
 
-@dataclass(frozen=True)
-class ShowPoses:
+class ShowPoses(NamedTuple):
     """The poses to draw: (n, 3) directions of up in the sensor frame, and the next pose."""
 
     up: Floats
@@ -294,16 +287,14 @@ class ShowPoses:
     frame_id: str
 
 
-@dataclass(frozen=True)
-class Mounting:
+class Mounting(NamedTuple):
     """The mounting in use: ΔR, (3, 3), and the frame of the sensor."""
 
     rotation: Floats
     frame_id: str
 
 
-@dataclass(frozen=True)
-class Result:
+class Result(NamedTuple):
     """The last fit, refinement or levelling, as JSON."""
 
     text: str

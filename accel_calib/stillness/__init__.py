@@ -5,20 +5,20 @@
 From samples to still poses. The node and recordings use the same rule.
 
 `chunks` sums the samples over short intervals of header time. `rule` decides whether the sensor is
-still in each chunk, from the arithmetic in `trend`. `dwell` joins still chunks to dwells, and
-accepts or rejects each, and `account` states why. `sensor` checks whether numbers can be those of
-a sensor, and `levels` what is too quiet for a rest. `detector` is the entry point, and makes the
-pose table. `ramp` makes the stretches of a still board whose temperature changes.
+still in each chunk, from the arithmetic in `trend`. `dwell` joins still chunks to dwells, accepts
+or rejects each, and states why. `detector` is the entry point: it makes the pose table, and checks
+whether numbers can be those of a sensor. `ramp` makes the stretches of a still board whose
+temperature changes.
 
 """
 
-from .account import account_of, Rest
 from .chunks import CaptureSettings, REPEATED, Repeated, settings_from
-from .detector import capture, Captured, poses_from, samples_of, select, StillDetector
-from .dwell import Dwell
+from .detector import (
+    capture, Captured, check_axes, check_measured, is_one_direction, poses_from, samples_of,
+    select, StillDetector)
+from .dwell import account_of, Dwell, Rest
 from .ramp import cells_of, is_turned_over, LEAST_RANGE, LEAST_RESTS, Ramp, ramp_of, rests_in_cells
 from .rule import rounding_left
-from .sensor import check_axes, check_measured, is_one_direction
 
 __all__ = ['LEAST_RANGE', 'LEAST_RESTS', 'REPEATED', 'Captured',
            'CaptureSettings', 'Dwell', 'Ramp', 'Repeated', 'Rest', 'StillDetector', 'account_of',

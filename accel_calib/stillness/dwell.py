@@ -40,6 +40,8 @@ dwell is rejected in three cases:
   dwell. Once five dwells determine the bias of the gyro, the gyro decides instead. It alone shows
   a turn at 0.3 °/s, or one that begins late in a dwell.
 
+**Account.** Every rest of a recording became a pose, or has one of `REASONS` why not.
+
 """
 
 from __future__ import annotations
@@ -48,18 +50,58 @@ from collections.abc import Iterator, Mapping, Sequence
 import copy
 from dataclasses import dataclass, field
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .account import Rest
 from .chunks import (
     CaptureSettings, chained, chunk_type, Chunks, CHUNKS_PER_WINDOW, Records, summed)
 from .rule import (
     DWELL_SLOPE_G, HORIZON, RELATIVE, rounding_left, Rule, STRENGTH, SURE, TURN_G, WEAK_STRENGTH)
 from .trend import excess_of_means, lines, strength_of
-from ..statistics import SIGMA_OF_MAD
+from ..finding import Finding
 from ..table import Floats
+from ..text import counted
+from ..units import SIGMA_OF_MAD
+
+REASONS: Mapping[str, tuple[str, str]] = {
+    'zeros': ('samples are missing: they are 0 on all axes', 'check the driver and the cable'),
+    'frozen': ('samples are missing: the last reading is repeated, though no other rest repeats '
+               'it', 'check the driver and the cable'),
+    'quiet': ('samples are missing: they vary far less than at all rests', 'check the driver: a '
+              'filter that starts looks so'),
+    'short': ('shorter than min_dwell', 'hold the sensor still for longer in each pose, or '
+              'capture shorter rests with --min-dwell {seconds:.2g}'),
+    'shaking': ('more variation than the noise of the sensor', 'put the sensor on something that '
+                'does not shake, or accept it with --still-std-max'),
+    'slope': ('a change of the reading', 'let go of the sensor, and wait until it has '
+              'settled'),
+    'turning': ('a turn, by the gyro', 'let go of the sensor in each pose'),
+    'noisy': ('noise that does not exclude a slow turn', 'hold the sensor still three times as '
+              'long in each pose'),
+    'length': ('a length that is not that of gravity', 'check the unit, or accept them with a '
+               'wider --still-norm-tolerance'),
+    'repeated': ('an earlier orientation', '')}
+"""Why a rest is no pose, and what to do about it."""
+
+MISSING = ('', 'zeros', 'frozen', 'quiet')
+"""What stands in a log where samples are missing: zeros, the last reading again and again, or what
+is far quieter than the rests of the sensor."""
+
+
+class Rest(NamedTuple):
+    """A rest from its first to its last stamp [s]; `reason` is one of `REASONS`, '' for a pose."""
+
+    start: float
+    end: float
+    reason: str = ''
+
+    @property
+    def words(self) -> str:
+        """Return why it is no pose; empty for a pose."""
+        return REASONS[self.reason][0] if self.reason else ''
+
 
 _FIGURES = [
     ('lowest', float, 6),     # lower confidence limit of the mean variance of the windows
@@ -197,11 +239,11 @@ class Dwell:
         return Rest(self.start, self.end, self.reason)
 
 
-def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -> list[Dwell]:
+def judged(table: Records, rule: Rule, context: Sequence[str]) -> list[Dwell]:
     """
-    Return each dwell from `first` on, with the reason why it is no pose with the noise known now.
+    Return the dwells of a table of `figures`, with the reason why one is no pose, if so.
 
-    All dwells of the table of `figures` are used. `context` names its columns of context.
+    They are tested with the noise known now. `context` names the columns of context.
 
     """
     means, std = table['mean'][:, :3], table['std']
@@ -221,8 +263,8 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -
     count = np.sum(rounded**2, axis=0) / np.sum(variance, axis=0)
     rate_std = np.maximum(np.sqrt(table['average'][:, 3:]), rate_step / math.sqrt(12.0))
     found = []
-    for each, own, n, own_rate, why, at_limit in zip(*(part[first:] for part in (
-            table, rounded.T.copy(), count, rate_std, reason, ends)), strict=True):
+    for each, own, n, own_rate, why, at_limit in zip(
+            table, rounded.T.copy(), count, rate_std, reason, ends, strict=True):
         around: dict[str, float | Floats] = {
             name: value for name, value in zip(context, each['around'].tolist(), strict=True)
             if math.isfinite(value)}
@@ -459,3 +501,23 @@ class Tracker:
                 max(_LEAST_REST * self._shortest, CHUNKS_PER_WINDOW), self._shortest)
             if found.chunks >= least:
                 yield found
+
+
+def account_of(rests: Sequence[Rest], settings: CaptureSettings) -> tuple[Finding, ...]:
+    """Return what was left out of a recording, and why most rests are no poses, if so."""
+    seconds: dict[str, list[float]] = {}
+    for each in rests:
+        seconds.setdefault(each.reason, []).append(each.end - each.start)
+    found = [Finding('missing', f'{sum(seconds[kind]):.3g} s are left out: {REASONS[kind][0]}',
+                     REASONS[kind][1]) for kind in MISSING[1:] if kind in seconds]
+    dropped = {reason: lengths for reason, lengths in seconds.items()
+               if reason not in (*MISSING, 'repeated')}
+    count, taken = sum(map(len, dropped.values())), len(seconds.get('', ()))
+    if count > taken:
+        most = max(dropped, key=lambda reason: len(dropped[reason]))
+        words, remedy = REASONS[most]
+        enough = min(0.9 * float(np.median(dropped[most])), 0.8 * settings.min_dwell)
+        found.append(Finding(
+            'not_taken', f'{len(dropped[most])} of {counted(count + taken, "rest")} gave no pose: '
+            f'{words}', remedy.format(seconds=enough), 'USABLE', step='record'))
+    return tuple(found)

@@ -26,7 +26,13 @@ upper bound of the noise if the sensor is still, and far above it if the sensor 
 minimum so far is used. The noise is at least the variance that the resolution causes: a reading
 that alternates between two steps of height q has a variance of up to q²/4, and q is the smallest
 step so far. Nothing is learned from an axis at the limit of the sensor, whose samples scatter
-less, nor from a gyro that does not vary. What is far quieter than all rests is none (`levels`).
+less, nor from a gyro that does not vary.
+
+**Levels.** The smallest variance so far is that of a rest, unless something else than the sensor
+was quieter once: a filter of the driver that started, or a gyro that was not on yet. It was then
+short, and in one orientation, while the rests of a sensor that is turned have one variance in many
+orientations. How often the samples of each axis had which variance is therefore counted: what is
+far quieter than all rests is none.
 
 **Rounding.** Samples x = μ + n with noise n of the standard deviation σ are rounded to multiples
 of q. The error of the mean of many samples depends on μ. Over all μ its variance is
@@ -45,16 +51,15 @@ References
 
 from collections.abc import Mapping
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records
-from .levels import Known, Levels
-from .trend import oscillation, sliding, Stretch, stretch
-from ..statistics import rms
+from .trend import oscillation, sliding, Stretch, stretch, window_figures
 from ..table import Floats
-from ..units import Units
+from ..units import rms, Units
 
 LONG = 12
 """Number of chunks from which the noise is estimated."""
@@ -146,6 +151,83 @@ LARGEST_OFFSET_G = 1.5
 WHITE = 4.0
 """Largest excess of a stretch whose scatter is noise rather than a motion."""
 
+_BINS, _ZERO = 128, 64
+"""Number of bins, by powers of 2 of the variance, and bin of a variance of 1."""
+
+_NEAR, _BELOW = 2, 4
+"""Bins on each side of the most frequent one that are of rests of the sensor, and number of bins
+below it from which on a variance is that of no rest."""
+
+_RARE = 5
+"""Ratio of the numbers of stretches at rest and of quieter ones above which these are no rests. An
+axis that does not vary at all is not measured, unless most rests are so, as of a coarse sensor."""
+
+_TURNED = 0.3
+"""Smallest range of the mean readings at rest of a sensor that was turned, relative to them."""
+
+_ONE_WAY = 0.2
+"""Largest range of the mean readings of what is quieter, relative to that at rest."""
+
+
+class Known(NamedTuple):
+    """
+    What all samples of a sensor show about it.
+
+    `least` are the (6,) variances of readings and rates below which nothing is a rest, 0 if they
+    are not known, and `repeats` is whether a rest can repeat one reading.
+
+    """
+
+    least: Floats = np.zeros(6)
+    repeats: bool = True
+
+
+class Levels:
+    """Counts of stretches by their variance, for each of 6 axes, with the range of readings."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros((6, _BINS), np.int64)
+        self._lowest = np.full((6, _BINS, 3), np.inf)
+        self._highest = np.full((6, _BINS, 3), -np.inf)
+        self._found: Floats | None = np.zeros(6)
+
+    def add(self, variance: Floats, reading: Floats) -> None:
+        """Count (axes, n) variances of stretches, NaN if unknown, with (3, n) mean readings."""
+        axis, which = np.nonzero(np.isfinite(variance))
+        if not len(axis):
+            return
+        self._found = None
+        with np.errstate(divide='ignore'):
+            level = np.floor(np.log2(variance[axis, which])) + _ZERO
+        found = axis, np.clip(level, 0, _BINS - 1).astype(np.intp)
+        np.add.at(self._counts, found, 1)
+        np.minimum.at(self._lowest, found, reading.T[which])
+        np.maximum.at(self._highest, found, reading.T[which])
+
+    @property
+    def least(self) -> Floats:
+        """Return the (6,) variances at rest where something was far quieter; 0 elsewhere."""
+        if self._found is None:
+            self._found = np.zeros(6)
+            for axis, counts in enumerate(self._counts):
+                lowest, highest = self._lowest[axis], self._highest[axis]
+                near = np.convolve(counts, np.ones(2 * _NEAR + 1), 'same')
+                most = int(np.argmax(near))
+                rests = slice(max(most - _NEAR, 0), most + _NEAR + 1)
+                peak = rests.start + int(np.argmax(counts[rests]))
+                quieter = slice(1, max(peak - _BELOW, 1))
+                count = int(np.sum(counts[quieter]))
+                if not (count + counts[0] and max(count * _RARE, counts[0]) < near[most]):
+                    continue
+                low, high = lowest[rests].min(axis=0), highest[rests].max(axis=0)
+                turned = np.max(high - low)
+                way = np.max(highest[quieter].max(axis=0, initial=-np.inf)
+                             - lowest[quieter].min(axis=0, initial=np.inf))
+                size = np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
+                if turned > _TURNED * size and way < _ONE_WAY * turned:
+                    self._found[axis] = 2.0**(peak - _ZERO)
+        return self._found
+
 
 class Rule:
     """
@@ -214,12 +296,7 @@ class Rule:
         if self._axes == 3 and np.isfinite(sums['first'][:, 3]).any():
             self._axes = 6
         axes, size = self._axes, len(judged)
-        # Means and variances, (axes, m), of the windows; the sums are relative to the origin.
-        first, second = (np.ascontiguousarray(sums[name].T[:axes]) for name in ('first', 'second'))
-        inside, total, power = (sliding(np.add, each, CHUNKS_PER_WINDOW)
-                                for each in (sums['count'], first, second))
-        level = np.maximum(power - total * (total / inside), 0.0) / (inside - 1.0)
-        means = total / inside + chunks.origin[:axes, np.newaxis]
+        means, level = window_figures(sums, chunks.origin[:axes])
         mean, recent = means[:, -size:], level[:, -size:]
         seen = {length: stretch(sums, level, length, size, chunks.length)
                 for length in SLOPE_CHUNKS}
@@ -232,30 +309,32 @@ class Rule:
         noise, varied = self._learn(seen[LONG], mean, judged['step'].T, *(
             sliding(np.maximum, each, LONG - CHUNKS_PER_WINDOW + 1)[..., -size:] > 0.0
             for each in gaps))
-        missing = np.where(zero[-size:] > 0.0, 1, np.where((equal[-size:] > 0.0) & varied, 2, 0))
         quiet = np.all(QUIETER * recent[:3] < self._given.least[:3, np.newaxis], axis=0)
-        missing[quiet & (missing == 0) & (equal[-size:] == 0.0)] = 3
+        missing = np.select([zero[-size:] > 0.0, (equal[-size:] > 0.0) & varied,
+                             (equal[-size:] == 0.0) & quiet], [1, 2, 3])
         measured = missing == 0
         self.quietest = float(np.fmin.reduce(
             recent[:3].max(axis=0)[measured], initial=self.quietest))
         scale = np.asarray(self._per_g)
         if not self.known:
             calm = measured & np.all(recent <= self.limit_of(noise), axis=0)
-            at_rest = np.where(calm, mean[:3], np.nan)
-            low = np.fmin.accumulate(np.column_stack([self._lowest, at_rest]), axis=1)[:, 1:]
-            high = np.fmax.accumulate(np.column_stack([self._highest, at_rest]), axis=1)[:, 1:]
-            self._lowest, self._highest = low[:, -1], high[:, -1]
-            scale = _half_range(low, high, noise[:3])
+            scale = self._widen(np.where(calm, mean[:3], np.nan), noise[:3])
         noise[:3] = np.fmax(noise[:3], (STD_FLOOR_G * scale)**2)
         limit = self.limit_of(noise)
         judged['sums']['level'][:, :axes], judged['limit'][:, :axes] = recent.T, limit.T
         judged['missing'], judged['trending'] = missing, self._trending(seen, mean, limit, scale)
         still = measured & (judged['trending'] == 0) & np.all(recent[:3] <= limit[:3], axis=0)
         still &= ~np.any(recent[3:] > limit[3:], axis=0)  # a rate can be NaN
-        if self._settings.still_gyro_max > 0.0:
-            still &= ~(np.sum(mean[3:]**2, axis=0) > self._settings.still_gyro_max**2)
-        judged['still'] = still
+        fastest = self._settings.still_gyro_max or math.inf
+        judged['still'] = still & ~(np.sum(mean[3:]**2, axis=0) > fastest**2)
         return judged
+
+    def _widen(self, at_rest: Floats, noise: Floats) -> Floats:
+        """Return half the range at each chunk, with (3, n) native readings at rest, or NaN."""
+        low = np.fmin.accumulate(np.column_stack([self._lowest, at_rest]), axis=1)[:, 1:]
+        high = np.fmax.accumulate(np.column_stack([self._highest, at_rest]), axis=1)[:, 1:]
+        self._lowest, self._highest = low[:, -1], high[:, -1]
+        return _half_range(low, high, noise)
 
     def is_steep(self, slope: Floats, scale: Floats, variance: Floats, drift_g: float = SLOPE_G
                  ) -> NDArray[np.bool_]:

@@ -96,6 +96,17 @@ def sliding(fold: np.ufunc, values: Floats, length: int) -> Floats:
         size *= 2
 
 
+def window_figures(sums: Records, origin: Floats) -> tuple[Floats, Floats]:
+    """Return the (axes, m) means and variances of all windows, of sums relative to an origin."""
+    first, second = (np.ascontiguousarray(sums[name].T[:len(origin)])
+                     for name in ('first', 'second'))
+    inside, total, power = (sliding(np.add, each, CHUNKS_PER_WINDOW)
+                            for each in (sums['count'], first, second))
+    mean = total / inside
+    variance = np.maximum(power - total * mean, 0.0) / (inside - 1.0)
+    return mean + origin[:, np.newaxis], variance
+
+
 def lines(values: Floats, length: int) -> Line:
     """Return the lines through all windows of this length: (..., n) to (..., n - length + 1)."""
     windows = sliding_window_view(values, length, axis=-1)

@@ -38,10 +38,9 @@ from ..errors import (
 from ..estimate import Prior
 from ..finding import Finding, KINDS, LEVELS, without
 from ..findings import mounting_figures
-from ..statistics import rms
 from ..table import Autopilot, check_values, COLUMNS, Floats, is_quantity, LARGEST, Poses
 from ..text import counted, LONGEST_NAME, plain, some
-from ..units import FRAMES, MODEL_NAMES, UNIT_NAMES, Units
+from ..units import FRAMES, MODEL_NAMES, rms, UNIT_NAMES, Units
 
 # The first is eight times as fast, but not in every build of PyYAML.
 SafeDumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
@@ -131,15 +130,12 @@ def _content(calibration: Calibration) -> dict[str, Any]:
         'covariance': calibration.covariance[np.ix_(model.stated, model.stated)].tolist(),
         'quality': asdict(calibration.quality),
         **({} if gyro is None else {'gyro_bias': {
-            'unit': 'rad/s, slope in rad/s/°C, temperatures in °C', 'bias': gyro.bias.tolist(),
-            'sd': gyro.sd.tolist(), 'slope': gyro.slope.tolist(),
-            'temperature': plain(float(gyro.temperature)),
-            'temperatures': [float(each) for each in gyro.temperatures],
-            'rests': int(gyro.rests)}}),
+            'unit': 'rad/s, slope in rad/s/°C, temperatures in °C', **{
+                name: plain(getattr(gyro, name)) for name in (
+                    'bias', 'sd', 'slope', 'temperature', 'temperatures', 'rests')}}}),
         **({} if noise is None else {'noise': {
             'what': 'standard deviation of one sample; force in the unit of the readings, rate in '
-                    'rad/s',
-            'force': plain(noise.force), 'rate': plain(noise.rate)}}),
+                    'rad/s', **plain(asdict(noise))}}),
         'rejected': [asdict(rejected) for rejected in calibration.rejected],
         'findings': [each.stated for each in without(calibration.noted, *OF_FILE)],
         'poses': {'row': poses.row.tolist(),
@@ -260,14 +256,12 @@ def _calibration(content: Mapping[str, Any], file: str, own: Sequence[OwnEffect]
     return Calibration(
         name=choice_at(content, 'model', _NAMES),
         method=choice_at(content, 'method', STORED_METHODS), model=model,
-        units=Units(unit, per_g), sensor=value_at(content, 'sensor', str),
-        stream=value_at(content, 'stream', str),
-        frame=choice_at(content, 'frame', FRAMES), date=value_at(content, 'date', str),
+        units=Units(unit, per_g), frame=choice_at(content, 'frame', FRAMES),
+        **{key: value_at(content, key, str) for key in ('sensor', 'stream', 'date', 'reason')},
         covariance=array_at(content, 'covariance', (size, size), finite=False, most=LARGEST),
-        quality=Quality(**quality),
+        quality=Quality(**quality), rejected=rejected,
         poses=_poses(value_at(content, 'poses', dict), _optional(
             content, 'autopilot', lambda stated: Autopilot(**stated))),
-        rejected=rejected, reason=value_at(content, 'reason', str),
         noted=tuple(Finding(
             rows=tuple(values_at(each, 'rows', int)), kind=choice_at(each, 'kind', tuple(KINDS)),
             text=value_at(each, 'text', str), advice=value_at(each, 'advice', str),

@@ -5,8 +5,8 @@
 Exports of a calibration to the places where it is used, and the plan of poses as CSV.
 
 An export is one entry of `FORMATS`, and a template of the same name in the folder ``templates``.
-The values for the templates are made in `.c_header` and `.formats`; `.made` measures what an
-export does not hold, and fills the template.
+The values for the templates are made in `.formats`; `.made` measures what an export does not hold,
+and fills the template.
 
 """
 
@@ -24,10 +24,10 @@ from typing import TextIO, TYPE_CHECKING
 
 import numpy as np
 
-from .c_header import header, identifier
 from .calibration_yaml import CORRECTION
 from .formats import (
-    affine, ardupilot, counts, imucal, Noise, noise_alone, openvins, px4, read_noise)
+    affine, ardupilot, counts, header, identifier, imucal, Noise, noise_alone, openvins, px4,
+    read_noise)
 from .made import difference_mg, Format, LEAST_LOSS_MG, Loss, losses_of, Made, Options, rendered
 from .. import __version__
 from ..calibration import Calibration

@@ -170,8 +170,7 @@ def steady_context(calibration: Calibration, temperature: Floats) -> Context:
             'time': np.full(count, time), 'supply_voltage': np.full(count, supply)}
 
 
-def steady_grid(calibration: Calibration, temperatures: int = 9, size: float = 1.0
-                ) -> Grid:
+def steady_grid(calibration: Calibration, temperatures: int = 9, size: float = 1.0) -> Grid:
     """Return forces of this size [g] over the sphere and the range of the temperature."""
     low, high = temperature_range(calibration) or (REFERENCE_TEMPERATURE, REFERENCE_TEMPERATURE)
     levels = np.linspace(low, high, temperatures if high > low else 1)

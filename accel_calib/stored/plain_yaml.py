@@ -115,7 +115,7 @@ class _Reader:
         """Return the value that starts with an event below this number of levels."""
         self._check(event)
         if isinstance(event, yaml.ScalarEvent):
-            return self._scalar(event) if event.implicit[0] else one_line(event.value)
+            return self._scalar(event) if event.implicit[0] else _text_of(event)
         if depth == MOST_DEPTH:
             raise self.refusal(event, f'it has more than {MOST_DEPTH} levels')
         if not isinstance(event, yaml.MappingStartEvent):
@@ -128,7 +128,7 @@ class _Reader:
             self._check(event)
             if not isinstance(event, yaml.ScalarEvent):
                 raise self.refusal(event, 'a key is a mapping or a list, expected a name')
-            key = one_line(event.value)
+            key = _text_of(event)
             if key in content:
                 raise self.refusal(event, f'the key {shown(key)} is stated twice, expected once')
             self.keys.append(key)
@@ -153,7 +153,7 @@ class _Reader:
         """Return the value of unquoted text; refuse dates and numbers that are not decimal."""
         text = event.value
         if len(text) > _LONGEST_NUMBER:
-            return one_line(text)
+            return _text_of(event)
         tag: str = _RESOLVER.resolve(  # type: ignore[no-untyped-call]
             yaml.ScalarNode, text, (True, False))
         kind = tag.rpartition(':')[2]
@@ -168,7 +168,7 @@ class _Reader:
                                'or text in quotes')
         if kind == 'bool':
             return SafeLoader.bool_values[text.lower()]
-        return None if kind == 'null' else one_line(text)
+        return None if kind == 'null' else _text_of(event)
 
     def refusal(self, event: yaml.Event, words: str) -> ValueError:
         """Return the error for an event, with its key and line."""
@@ -178,6 +178,12 @@ class _Reader:
 
 
 _RESOLVER = Resolver()
+
+
+def _text_of(event: yaml.ScalarEvent) -> str:
+    """Return the text of an event as one printable line, which it nearly always is."""
+    text: str = event.value
+    return text if text.isprintable() else one_line(text)
 
 
 def value_at(content: Mapping[str, Any], key: str, kind: type[Kind]) -> Kind:

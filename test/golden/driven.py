@@ -12,7 +12,7 @@ import accel_calib as ac
 from accel_calib.calibration import Calibration, fit_poses, level, SampleNoise
 from accel_calib.logs import doubles_at, joined, layout_of, renamed, samples_of
 from accel_calib.messages import corrected, motion_of, output_frame, Rewriter
-from accel_calib.session import diagnostics, state
+from accel_calib.session import diagnostics, progress
 from accel_calib.units import units_of
 from driven import Driver
 from golden.figures import attempt, of_next_pose, those
@@ -63,7 +63,7 @@ class _Driver(Driver):
     def state(self) -> Any:
         """Return progress, diagnostics, checks and poses."""
         drift = self.session.sensor.drift
-        return [state.progress(self.session.state), dict(health_figures(self.session.state)),
+        return [progress(self.session.state), dict(health_figures(self.session.state)),
                 diagnostics(self.session.state)[1:], self.shown and {
                     **those(self.shown, 'up frame_id'), 'asked': of_next_pose(self.shown.asked)},
                 self.session.sensor.live.poses(),
