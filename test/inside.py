@@ -56,7 +56,7 @@ from accel_calib.geometry import (
 from accel_calib.logs import (
     bag_samples, child, is_port, layout_with, LogOptions, open_bag, open_log, port, text)
 from accel_calib.logs.bag import frame_ids, stamps_of
-from accel_calib.logs.names import format_named, meaning
+from accel_calib.logs.names import meaning
 from accel_calib.logs.port import _interval as interval_of_lines
 from accel_calib.logs.quantities import are_samples
 from accel_calib.noise.allan import (
@@ -87,7 +87,7 @@ from accel_calib.session import store as session_store, worker
 from accel_calib.session.commands import poses_changed
 from accel_calib.session.conditions import figures, step_of
 from accel_calib.session.poses import Guide, LiveCapture
-from accel_calib.session.settings import capture_settings, changed
+from accel_calib.session.settings import changed
 from accel_calib.session.state import new_sensor
 from accel_calib.session.store import (
     aside, MOST_STEPS, SensorFiles, Store as SensorStore, store_of)

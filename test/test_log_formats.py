@@ -13,7 +13,7 @@ from accel_calib.logs import LogOptions
 from accel_calib.stillness import capture
 from accel_calib.table import Recording
 from data.logs import make
-from inside import format_named, Log, read_log
+from inside import Log, read_log
 import numpy as np
 import pytest
 from shared import LOGS
@@ -22,10 +22,10 @@ from test_logs import write
 WITHIN_SD = 5.0
 
 
-def px4(name: str | Path, topic: str = '', sensor: str = '') -> Log:
-    """Read a sample of PX4, or another path."""
+def px4(path: Path) -> Log:
+    """Read a log of PX4."""
     pytest.importorskip('pyulog')
-    return read_log(LOGS / 'px4' / name, LogOptions(topic=topic, sensor=sensor))
+    return read_log(path)
 
 
 def ardupilot(name: str | Path) -> Log:
@@ -67,29 +67,6 @@ def test_the_truth_of_a_sample_is_found_without_options_and_with_its_format(name
     np.testing.assert_allclose(named.table['time'], log.table['time'], rtol=1e-12)
 
 
-@pytest.mark.parametrize(('name', 'advice'), list(zip(make.WITHOUT_GRAVITY, (
-    "record 'Acceleration with g'", 'use TotalAcceleration.csv'), strict=True)))
-def test_a_log_without_gravity_is_refused_and_the_maker_s_other_log_is_named(
-        name: str, advice: str) -> None:
-    with pytest.raises(InputError, match='gravity') as caught:
-        read_log(LOGS / name)
-    assert advice in caught.value.advice
-
-
-@pytest.mark.parametrize('stated', ['', 'sensor-logger', 'matlab', 'esp32'])
-@pytest.mark.parametrize('name', make.OTHER_SENSORS)
-def test_a_log_of_another_sensor_with_the_same_columns_is_refused(name: str, stated: str) -> None:
-    with pytest.raises(InputError, match='another sensor'):
-        read_log(LOGS / name, LogOptions(format=stated))
-
-
-def test_another_and_an_unknown_format_are_refused_with_what_is_lacking_or_meant() -> None:
-    with pytest.raises(InputError, match='lacks .*accSmooth'):
-        read_log(LOGS / 'phyphox/comma_point.csv', LogOptions(format='betaflight'))
-    with pytest.raises(InputError, match='use phyphox'):
-        format_named('phypox', ['Time (s)'], 'log.csv')
-
-
 def test_a_flat_pose_makes_a_level_vehicle_read_up() -> None:
     log = read_log(LOGS / 'px4/log_sensor_accel_0.csv')
     poses = capture(log.table, log.units).poses  # type: ignore[arg-type]
@@ -102,36 +79,7 @@ def test_a_flat_pose_makes_a_level_vehicle_read_up() -> None:
 
 # ---------------------------------------------------------------------------------- PX4 logs
 
-def test_a_log_of_the_default_profile_gives_the_selected_sensor_with_its_temperature() -> None:
-    log, samples = px4('default.ulg'), make.recording(40, down=True)
-    assert log.table.sensor == 'sensor_combined 0'
-    np.testing.assert_allclose(log.table['temperature'], samples['temperature'], atol=0.08)
-    np.testing.assert_allclose(np.diff(log.table['time']), 1.0 / make.RATE_HZ, atol=1e-6)
-    assert any('CAL_ACC' in note for note in log.notes)
-
-
-def test_the_named_message_and_sensor_of_a_px4_log_are_read() -> None:
-    found = px4('default.ulg', 'sensor_accel', '1').table
-    samples = make.recording(40, down=True)
-    assert found.sensor == 'sensor_accel 1'
-    np.testing.assert_allclose(found.reading[:, 0], samples.reading[::20, 0] * make.G, rtol=1e-6)
-    with pytest.raises(InputError, match='has sensor_accel 0, expected vehicle_imu'):
-        px4('thermal.ulg', 'vehicle_imu')
-
-
-def test_a_name_of_the_sensor_names_it_and_does_not_choose() -> None:
-    log = px4('thermal.ulg', sensor='left imu')
-    assert log.table.sensor == 'left imu'
-    assert 'sensor_accel 0' in log.read_as
-    with pytest.raises(InputError, match='expected a message 3'):
-        px4('thermal.ulg', sensor='3')
-
-
-def test_vehicle_imu_is_divided_by_its_interval_and_not_read_without_it(tmp_path: Path) -> None:
-    found = px4('default.ulg', 'vehicle_imu').table
-    samples = make.recording(40, down=True)
-    np.testing.assert_allclose(found.reading[:, 2], samples.reading[::10, 2] * make.G, rtol=1e-6)
-    np.testing.assert_allclose(found['rate'][:, 1], samples['rate'][::10, 1], atol=1e-6)
+def test_vehicle_imu_is_not_read_without_its_interval(tmp_path: Path) -> None:
     fields = make.imu_fields(make.recording(1), 1)  # of another version of PX4
     del fields['delta_velocity_dt']
     with pytest.raises(InputError, match='none of the messages'):
@@ -157,31 +105,6 @@ def test_flight_logs_that_are_cut_off_are_read_up_to_there(tmp_path: Path) -> No
 
 
 # ----------------------------------------------------------------------------- ArduPilot logs
-
-@pytest.mark.parametrize('name', ['two_imus.bin', 'two_imus.csv'])
-def test_of_two_sensors_the_lowest_or_the_one_that_is_named_is_read(name: str) -> None:
-    if name.endswith('.bin'):
-        pytest.importorskip('pymavlink')
-    path = LOGS / 'ardupilot' / name
-    lowest = read_log(path)
-    assert len(lowest.table) == len(make.recording(50))
-    one, same = (read_log(path, LogOptions(sensor=text)).table for text in ('1', '1.0'))
-    samples = make.recording(51, down=True, poses=6)
-    np.testing.assert_allclose(one.reading, samples.reading * make.G, rtol=1e-5, atol=1e-6)
-    assert same == one
-    with pytest.raises(InputError, match='0, .*1, expected .*2'):
-        read_log(path, LogOptions(sensor='2'))
-    if name.endswith('.bin'):
-        assert lowest.table.sensor == 'IMU 0'
-        assert any('IMU 1' in note for note in lowest.notes)
-
-
-def test_the_text_log_has_the_numbers_of_the_binary_log() -> None:
-    binary, text = ardupilot('two_imus.bin'), ardupilot('one_imu.log')
-    assert set(binary.table.columns) == set(text.table.columns)
-    for key, values in binary.table.columns.items():
-        np.testing.assert_allclose(text.table[key], values, rtol=1e-6, atol=1e-9)
-
 
 def test_garbage_within_an_ardupilot_log_is_passed_over_and_noted(tmp_path: Path) -> None:
     whole = (LOGS / 'ardupilot/raw_acc.bin').read_bytes()

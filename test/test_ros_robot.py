@@ -28,9 +28,11 @@ import pytest
 from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, Temperature
-from shared import GRAVITY, Readings, Stored
+from shared import GRAVITY, Readings, Stored, wait
 from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
+from test_ros_watch import free_port, page_link
+from viewer import Viewer
 
 
 def test_the_mounting_comes_from_the_static_transforms_and_is_published(
@@ -230,14 +232,14 @@ def test_a_signal_at_any_time_of_the_start_ends_the_node_without_a_traceback(ben
         assert 'Traceback' not in printed
 
 
-def test_the_managed_node_loads_on_configure_and_publishes_when_active(
+def test_the_managed_node_loads_and_has_a_page_on_configure_and_publishes_when_active(
         bench: Any, stored: Stored) -> None:
     from lifecycle_msgs.msg import Transition
     from lifecycle_msgs.srv import GetState
     from rcl_interfaces.srv import SetParameters
     from rclpy.parameter import Parameter
     heard = bench.listen(Imu, 'imu/data_calibrated')
-    process = bench.start('calibrator_lifecycle', calibration_file=stored())
+    process = bench.start('calibrator_lifecycle', calibration_file=stored(), web_port=free_port())
     tried = {'model': '77', 'frame': 'ned', 'gravity': 9.81, 'mounting_rpy': [0.0, 0.0, 0.5]}
 
     def set_all() -> list[bool]:
@@ -257,17 +259,23 @@ def test_the_managed_node_loads_on_configure_and_publishes_when_active(
         bench.ask(GetState, 'calibrator/get_state')
         return len(heard)
 
-    for _ in range(2):
+    for count in (1, 2):  # the second page is at the same port
         bench.go(Transition.TRANSITION_CONFIGURE)
+        viewer = Viewer(page_link(bench, process, count))
+        bench.spin(lambda viewer=viewer: viewer.of('state') and viewer.state['calibration'])
         bench.spin(lambda: publisher.get_subscription_count() > 0)
         assert set_all() == [False] * 4
         assert pushes() == 0
         bench.go(Transition.TRANSITION_ACTIVATE)
-        bench.spin(lambda: pushes() > 0)
+        bench.spin(lambda viewer=viewer: pushes() > 0 and any(
+            each['length'] for each in viewer.of('progress')))
+        assert viewer.ask('disable', bench.spin)['success']
         bench.go(Transition.TRANSITION_DEACTIVATE)
         pushes()
         assert pushes() == 0
         bench.go(Transition.TRANSITION_CLEANUP)
+        wait(lambda viewer=viewer: viewer.code)
+        viewer.close()
         state = bench.ask(GetState, 'calibrator/get_state').current_state
         assert state.label == 'unconfigured'
     assert bench.end(process, signal.SIGINT)[0] == 0

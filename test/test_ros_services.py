@@ -23,8 +23,8 @@ from accel_calib.stored import read_calibration
 from diagnostic_msgs.msg import DiagnosticArray
 from faults.sample import sample
 from inside import (
-    capture_settings, changed, fit_in_node, Model, PATIENCE_OF_A_WORKER, simulate_poses,
-    spread_directions, Worker, WorkerProcess)
+    changed, fit_in_node, Model, PATIENCE_OF_A_WORKER, simulate_poses, spread_directions, Worker,
+    WorkerProcess)
 from inside_ros import in_executor, pose_markers, serve, SimulatorSettings
 import numpy as np
 import pytest
@@ -125,13 +125,6 @@ def test_parameters_accept_numbers_of_other_types_and_lists() -> None:
 def test_values_that_parameters_do_not_accept_are_refused(name: str, value: Any) -> None:
     with pytest.raises(InputError, match=f'parameter {name} is .*, expected '):
         changed(CalibratorSettings(), {name: value})
-
-
-def test_lists_of_another_length_and_settings_that_contradict_each_other_are_refused() -> None:
-    with pytest.raises(InputError, match='a list of 3 numbers'):
-        changed(SimulatorSettings(), {'mounting': [1.0]})
-    with pytest.raises(InputError, match='max_dwell'):
-        capture_settings(CalibratorSettings(min_dwell=2.0, max_dwell=3.0))
 
 
 def test_node_declares_all_parameters_and_refuses_invalid_values_while_it_runs(bench: Any) -> None:

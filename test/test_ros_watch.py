@@ -22,12 +22,10 @@ from typing import Any
 from accel_calib.stored import read_calibration
 from faults.sample import sample
 from inside import CALIBRATOR, COMMAND, spread_directions
-from lifecycle_msgs.msg import Transition
 import numpy as np
 import pytest
 import rcl_interfaces.msg
-from sensor_msgs.msg import Imu
-from shared import Readings, Stored, wait
+from shared import Readings, wait
 from viewer import fetch, link_of, Viewer
 
 WATCH = (*COMMAND, 'watch')
@@ -201,22 +199,3 @@ def test_a_node_whose_port_is_in_use_says_so_and_works_on(
         bench.feed(still)
         assert 'pose' in bench.call_while('capture_pose', lambda: bench.imu(still[-1])).message
         assert node.poll() is None
-
-
-def test_the_managed_node_serves_the_page_while_it_is_configured(
-        bench: Any, stored: Stored) -> None:
-    node = bench.start('calibrator_lifecycle', calibration_file=stored(), web_port=free_port())
-    publisher = bench.node.create_publisher(Imu, 'imu/data_raw', 100)
-    for count in (1, 2):  # the second page is at the same port
-        bench.go(Transition.TRANSITION_CONFIGURE)
-        viewer = Viewer(page_link(bench, node, count))
-        bench.spin(lambda viewer=viewer: viewer.of('state') and viewer.state['calibration'])
-        bench.go(Transition.TRANSITION_ACTIVATE)
-        bench.spin(lambda viewer=viewer: publisher.publish(bench.imu([0.1, 0.2, 9.8])) or any(
-            each['length'] for each in viewer.of('progress')))
-        assert viewer.ask('disable', bench.spin)['success']
-        bench.go(Transition.TRANSITION_DEACTIVATE)
-        bench.go(Transition.TRANSITION_CLEANUP)
-        wait(lambda viewer=viewer: viewer.code)
-        viewer.close()
-    assert bench.end(node, signal.SIGTERM)[0] == 0

@@ -23,6 +23,7 @@ from golden.record import parted, plain
 from golden.sweeps import SWEEPS
 from inside import main, meaning, poses_of, read_log
 import numpy as np
+import pytest
 from shared import LOG_CORPUS, options_of
 import yaml
 
@@ -46,6 +47,8 @@ def _of_case(case: dict[str, Any]) -> Any:
     if 'names' in case:
         return {name: attempt(meaning, name) for name in case['names']}
     if 'read' in case:
+        for library in case.get('needs', ()):
+            pytest.importorskip(library)
         return _read(case['read'])
     files = {file: made for file, made in case.items() if file not in _SETTINGS}
     for file, made in files.items():

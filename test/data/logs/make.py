@@ -226,10 +226,6 @@ def dataflash_bytes(rows: Sequence[Row]) -> bytes:
 COUNTS = 2048
 """acc_1G of the simulated flight controller."""
 
-
 TRUTHS: dict[str, Truth] = {name: truth(**given) for name, given in yaml.safe_load(
     Path(__file__).with_name('truths.yaml').read_text(encoding='utf-8')).items()}
 """What a fit of each sample with gravity is to find."""
-
-WITHOUT_GRAVITY = ('phyphox/without_g.csv', 'sensor-logger/android/Accelerometer.csv')
-OTHER_SENSORS = ('sensor-logger/android/Gravity.csv',)
