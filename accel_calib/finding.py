@@ -46,6 +46,7 @@ KINDS: Mapping[str, str] = MappingProxyType({
     'not_covered': 'a part of the sphere is far from all poses',
     'doubtful': 'the sensor may have moved during poses that are used',
     'beyond_noise': 'the residuals are larger than the noise explains',
+    'below_noise': 'the residuals are far smaller than the noise that is stated',
     'settling': 'the readings changed with time, and may change again',
     'thermal_step': 'the readings of a still board jump',
     'not_corrected': 'an effect cannot be corrected in single samples',

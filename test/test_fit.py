@@ -118,6 +118,13 @@ def test_poses_that_scatter_alike_have_weights_alike_and_true_deviations():
     assert lost == 0
 
 
+@pytest.mark.parametrize('factor', [1.0, 3.0, 100.0])
+def test_overstated_noise_is_noted(factor):
+    poses = ac.simulate({'offset': [0.03, -0.02, 0.04]}, poses=40, seed=1)
+    found = ac.fit(poses.with_columns(std=factor * poses['std']))
+    assert ('below_noise' in [each.kind for each in found.findings]) == (factor > 1.0)
+
+
 @pytest.mark.parametrize('seed', range(8))
 def test_the_scatter_of_a_fit_is_that_of_its_residuals(seed):
     poses = scattering(seed, 4.2e-4, 100, 1.0)[1]

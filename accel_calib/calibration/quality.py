@@ -25,6 +25,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+import scipy
 
 from .calibration import Calibration, check_sensor, PRIOR, Quality, Rejected
 from .directions import WEAK_DILUTION
@@ -242,9 +243,12 @@ _MOST_NAMED = 5
 _LARGE_CHI2 = 4.0
 """chi² per degree of freedom above which a fit warns."""
 
+_SMALL_CHI2 = 1e-9
+"""Probability of a chi² as small, below which the noise is overstated."""
 
-OF_A_FIT = ('no_check', 'not_covered', 'noise_not_known', 'beyond_noise', 'hardly_checked',
-            'outlier_not_certain')
+
+OF_A_FIT = ('no_check', 'not_covered', 'noise_not_known', 'beyond_noise', 'below_noise',
+            'hardly_checked', 'outlier_not_certain')
 """Kinds of findings about one fit, which do not hold for another fit."""
 
 
@@ -268,6 +272,12 @@ def fit_findings(fit: Fit, dilution: float) -> tuple[Finding, ...]:
             'beyond_noise', f'the residuals are {np.sqrt(fit.chi2 / fit.dof):.1f} times the noise '
             'of the pose means: poses repeat worse than the noise of their samples predicts, or '
             'the model lacks an effect', 'run refine to find the missing effect', step='refine'))
+    elif fit.dof > 0 and scipy.special.chdtr(fit.dof, fit.chi2) < _SMALL_CHI2:
+        found.append(Finding(
+            'below_noise', f'the residuals are {np.sqrt(fit.chi2 / fit.dof):.2g} times the noise '
+            'of the pose means: it is overstated, and effects smaller than it are not found',
+            'check the unit of std, and count; a vibration during the poses can be the cause, '
+            'too'))
     unseen = unseen_mistakes(fit) if fit.dof != 0 and fit.prior is None else np.zeros(0)
     rows = fit.poses_g.row[:len(unseen)][unseen > _UNSEEN_G].tolist()
     if rows:

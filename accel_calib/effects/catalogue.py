@@ -158,7 +158,12 @@ def _after(context: Mapping[str, Any], shape: Floats) -> Any:
 
 
 def _centripetal(context: Mapping[str, Any], shape: Floats) -> Floats:
-    """Return the (9, n) entries of ω×(ω×·) per metre [g], row by row."""
+    """
+    Return the (9, n) entries of ω×(ω×·) per metre [g], row by row.
+
+    dω/dt×· is left out: poses have none, and the derivative of a measured rate is mostly noise.
+
+    """
     rate = np.asarray(context['rate'], float).T
     squared = np.sum(rate ** 2, axis=0)
     entries = [rate[i] * rate[j] - (squared if i == j else 0.0)
