@@ -247,6 +247,14 @@ def test_the_commands_of_the_next_steps_lead_to_the_end(effects, kinds, command,
     assert set(calibration.model.effects) >= set(effects)
 
 
+def test_no_next_command_reads_other_rows(tmp_path):
+    poses = written(tmp_path / 'poses.csv', COMMON)
+    fit, refine = (result_of(f'accel-calib {command} {poses} --units g --rows 1:30', tmp_path)
+                   for command in ('fit', 'refine'))
+    assert '--rows 1:30' in fit['next']['command']
+    assert (refine['next']['kind'], refine['next']['command']) == ('level', '')
+
+
 @pytest.mark.parametrize(('effects', 'poses'), [(COMMON, 40), (HIDDEN, 40), (COMMON, 8)])
 def test_the_same_poses_have_the_same_verdict_and_next_step_everywhere(effects, poses, tmp_path):
     table, stored = written(tmp_path / 'poses.csv', effects, poses), tmp_path / 'c.yaml'

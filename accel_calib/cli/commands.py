@@ -98,9 +98,11 @@ def next_command(step: NextStep, args: argparse.Namespace) -> str:
     match step.kind:
         case 'fit' | 'refine' if log:
             return command_line(step.kind, args, **files)
-        # No command levels a calibration and keeps what it has from other poses.
+        # No command levels a calibration and keeps what it has from other poses or of some rows.
         case 'level' if base is None and args.command in ('fit', 'calibrate', 'refine', 'thermal'):
             name = 'calibrate' if args.command == 'refine' else args.command
+            if name == 'calibrate' and getattr(args, 'rows', None):
+                return ''
             return command_line(name, args, **files, flat=next(iter(step.rows), 'ROW'))
         case 'verify' if written or base:
             return command_line('verify', args, poses='NEW_POSES', calibration=written or base)
