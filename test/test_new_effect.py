@@ -19,11 +19,11 @@ from accel_calib.effects import (
     AXES, by_axis, correct, Effect, EFFECTS, effects_of_file, Model, ONE)
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.logs import layout_of
-from accel_calib.messages import Rewriter
+from accel_calib.messages import OneReading, Rewriter
 from accel_calib.report import refinement_page
 from accel_calib.table import Recording
 from bag_files import header, IMU, imu
-from inside import COMMAND, Correction, OneReading
+from inside import COMMAND, Correction
 import numpy as np
 import pandas as pd
 import pytest
