@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
+from .statistics import rms
 from .table import Floats
-from .units import rms
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:

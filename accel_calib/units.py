@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Units of readings, converted to g at the edge of the package; other names that users choose; RMS.
+Units of readings, converted to g at the edge of the package, and the other names users choose.
 
 They stand below all folders, so that ``accel-calib fit --help`` does not load the calibration.
 
@@ -105,30 +105,3 @@ def units_of(name: UnitName, gravity: float = STANDARD_GRAVITY) -> Units:
 
     """
     return Units(name, gravity if name == 'm/s2' else 1.0)
-
-
-# ----------------------------------------------------------------------------- statistics
-
-NORMAL_95 = 1.959964
-"""Half the width of the interval that holds a normal value in 95 % of all cases [σ]."""
-
-SIGMA_OF_MAD = 1.4826
-"""Standard deviation of normal values by their median absolute deviation."""
-
-STATED_NOISE = 0.7
-"""Prior probability that the measured noise is the noise of the pose means."""
-
-
-def rms(values: Floats) -> float:
-    """Return the root of the mean square of numbers."""
-    return float(np.sqrt(np.mean(values ** 2)))
-
-
-def rms_of_rows(values: Floats) -> Floats:
-    """Return the RMS of (…, n) numbers over the last axis."""
-    return np.sqrt(np.mean(values ** 2, axis=-1))
-
-
-def over_axes(values: Floats) -> Floats:
-    """Return the (n,) values of a quantity; of (n, 3) vectors, the RMS over the axes."""
-    return rms_of_rows(values) if values.ndim > 1 else values

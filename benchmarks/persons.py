@@ -12,7 +12,7 @@ from unittest.mock import patch
 
 from accel_calib.geometry import ATTITUDES, spread_directions, unit
 from accel_calib.session import COMMANDS, conditions
-from accel_calib.units import rms
+from accel_calib.statistics import rms
 from driven import Driver, GRAVITY, Person
 from figures import Frame, markdown
 import numpy as np

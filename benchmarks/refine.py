@@ -26,8 +26,9 @@ from typing import Any
 
 from accel_calib.calibration import fit_poses, verify
 from accel_calib.refinement import refine as refine_poses
+from accel_calib.statistics import rms
 from accel_calib.table import Poses
-from accel_calib.units import MG, rms, units_of
+from accel_calib.units import MG, units_of
 from figures import Frame, Line, markdown, table, tell
 from generator import again, ON_OUTPUT, simulate, Simulated
 import numpy as np

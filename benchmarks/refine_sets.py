@@ -18,8 +18,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
+from accel_calib.statistics import rms
 from accel_calib.table import Floats
-from accel_calib.units import MG, rms
+from accel_calib.units import MG
 from generator import basis_of, EFFECTS, ON_OUTPUT, OUTSIDE, Setup, Simulated, STANDARD_GRAVITY
 import numpy as np
 from scipy.optimize import least_squares

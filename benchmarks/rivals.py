@@ -25,8 +25,9 @@ from accel_calib.effects import add_history, EFFECTS, factors_of
 from accel_calib.estimate import judge
 from accel_calib.refinement.linear import SEEN
 from accel_calib.refinement.state import candidates, orthonormal
+from accel_calib.statistics import rms
 from accel_calib.table import Floats, Poses
-from accel_calib.units import rms, units_of
+from accel_calib.units import units_of
 from figures import Frame, markdown
 from generator import again, basis_of, simulate, Simulated
 import numpy as np

@@ -9,11 +9,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from accel_calib.calibration import Calibration, fit_poses
-from accel_calib.effects.history import path
+from accel_calib.effects.simulate import path
 from accel_calib.errors import AccelCalibError
+from accel_calib.statistics import rms
 from accel_calib.stillness import capture
 from accel_calib.table import Floats, numbered, Recording
-from accel_calib.units import rms, units_of
+from accel_calib.units import units_of
 from figures import Frame, Line, table
 import numpy as np
 from scipy.signal import lfilter

@@ -27,8 +27,8 @@ from accel_calib.geometry import spread_directions, unit
 from accel_calib.logs import LogOptions, open_log
 from accel_calib.pipeline import calibrated_log, Outcome, poses_of
 from accel_calib.session import columns_of, diagnostics
+from accel_calib.statistics import rms
 from accel_calib.table import concatenated, Floats
-from accel_calib.units import rms
 from bag_files import fill, header, IMU, imu, writer_of
 from driven import Driver
 from figures import Frame, markdown, tell

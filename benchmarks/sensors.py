@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 
 from accel_calib.effects import Model, model_with
 from accel_calib.geometry import spread_directions, unit
+from accel_calib.statistics import rms
 from accel_calib.table import COLUMNS, concatenated, Floats, numbered, Poses
-from accel_calib.units import MG, rms
+from accel_calib.units import MG
 from generator import Simulated
 import numpy as np
 

@@ -16,8 +16,8 @@ from accel_calib.finding import Finding, NextStep
 from accel_calib.findings import rate, Rating
 from accel_calib.refinement import refine
 from accel_calib.report import calibration_page, refinement_page
+from accel_calib.statistics import rms
 from accel_calib.text import milli
-from accel_calib.units import rms
 from inside import (
     all_drawings, axis_figures, comparison_page, curve_parts, linear_model, model_with, page_of,
     residuals_of, simulate_poses)

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / 'accel_calib'
 
 LAYERS = (
-    'text units < errors < disk finding < table < geometry < effects '
+    'text units < errors statistics < disk finding < table < geometry < effects '
     '< logs < stillness estimate < calibration < refinement < comparison noise < findings '
     '< stored < pipeline < messages < report < api session < fleet live < ros < cli')
 """Parts of the package, lowest first. Each part imports only from lower parts and itself."""
@@ -25,7 +25,7 @@ ROS = re.compile(r'rclpy|ament_\w+|launch(_\w+)?|tf2_\w+|rosidl_\w+|\w+_(msgs|sr
 
 MODULES = sorted(PACKAGE.rglob('*.py'))
 BASE = {f'accel_calib.{name}' for name in (
-    'disk', 'errors', 'finding', 'geometry', 'table', 'text', 'units')}
+    'disk', 'errors', 'finding', 'geometry', 'statistics', 'table', 'text', 'units')}
 """Modules that tests import from directly."""
 
 FACES = {'accel_calib', *(f'accel_calib.{each.parent.name}'

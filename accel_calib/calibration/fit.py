@@ -44,10 +44,11 @@ from ..estimate import (
     with_scatter_of)
 from ..finding import explained_by, Finding
 from ..geometry import unit
+from ..statistics import rms
 from ..stillness import check_axes
 from ..table import check_units, Poses
 from ..text import listed, short
-from ..units import Floats, Indices, Method, METHODS, MG, MODEL_NAMES, rms, Units
+from ..units import Floats, Indices, Method, METHODS, MG, MODEL_NAMES, Units
 
 _LARGEST_REST_G = 3.0
 _NATIVE_SPREADS = 20.0

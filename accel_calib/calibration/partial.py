@@ -62,9 +62,10 @@ from ..estimate import (
     estimate, Fit, judge, LARGEST_SHARE, NotConvergedError, originals, Prior, variance_factor)
 from ..finding import Finding, without
 from ..geometry import cone_of, unit
+from ..statistics import STATED_NOISE
 from ..table import check_units, Poses
 from ..text import counted, enumerated
-from ..units import Floats, Indices, MG, STATED_NOISE, Units
+from ..units import Floats, Indices, MG, Units
 
 NAME = '10'
 """The model whose values have priors."""

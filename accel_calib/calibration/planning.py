@@ -59,9 +59,10 @@ from ..estimate import Fit, fit_sphere, judge, kinds, pose_noise
 from ..finding import Finding
 from ..geometry import (
     ATTITUDES, axes_of_signs, coverage, OVER_THE_SPHERE, spread_directions, TAKEN, words_of)
+from ..statistics import over_axes
 from ..table import Floats, is_quantity, Poses
 from ..text import enumerated
-from ..units import MG, over_axes, Units
+from ..units import MG, Units
 
 _LEAST_HELP = 0.03
 """Smallest useful reduction of the error by a pose; 17 well spread poses reach it."""

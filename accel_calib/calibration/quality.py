@@ -36,9 +36,10 @@ from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import believable, Fit, judge, left_out, Rival, unseen_mistakes
 from ..finding import Finding, without
 from ..geometry import coverage, OVER_THE_SPHERE, unit
+from ..statistics import over_axes, rms
 from ..table import Floats, in_unit, Poses
 from ..text import listed
-from ..units import MG, over_axes, rms, Units
+from ..units import MG, Units
 
 _LEAST_OWN = 1e-4
 """Below this part that other orientations check, one alone determines a parameter, and its error

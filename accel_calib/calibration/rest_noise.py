@@ -51,9 +51,9 @@ import numpy as np
 from numpy.typing import NDArray
 import scipy
 
+from ..statistics import NORMAL_95, SIGMA_OF_MAD
 from ..stillness import Dwell
 from ..table import Floats, Poses, range_of, Record
-from ..units import NORMAL_95, SIGMA_OF_MAD
 
 LARGEST_BIAS = 1.0
 """Largest bias of a gyro [rad/s]; a larger rate is in another unit, or is no rest."""

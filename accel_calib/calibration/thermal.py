@@ -52,9 +52,10 @@ from ..errors import InputError
 from ..estimate import judge
 from ..finding import Finding
 from ..geometry import coverage, unit
+from ..statistics import rms
 from ..stillness import Ramp
 from ..table import concatenated, Floats, numbered, Poses, range_of
-from ..units import MG, rms, Units
+from ..units import MG, Units
 
 _POWERS = OFFSET_POWERS[1:]
 _LINEAR, _RATE, _STEP = _POWERS[0], 'temperature_rate', 'offset_step'

@@ -36,9 +36,10 @@ import numpy as np
 
 from ..calibration import Calibration
 from ..effects import Context, length_rows, sensor_force
+from ..statistics import rms, SIGMA_OF_MAD
 from ..table import Floats, range_of
 from ..text import counted
-from ..units import MG, rms, SIGMA_OF_MAD
+from ..units import MG
 
 MEMORY = 6
 """Number of rests that are used."""

@@ -7,8 +7,8 @@ Effects: what each adds to the reading, and its properties.
 `form` defines what an effect is, and `catalogue` lists those with a known cause. `records` are
 effects beyond the catalogue: curves, with their formulas for a paper or for firmware, and
 covariates. `own` are those of a user, and `model` computes with a list of them. `thermal` finds
-how the temperature lags and what it is between the steps of a thermometer, and `history` how each
-pose was reached; it also simulates poses and recordings.
+how the temperature lags and what it is between the steps of a thermometer, `history` how each pose
+was reached, and `simulate` makes poses and recordings.
 
 An effect is one entry in `EFFECTS`. Simulation, fit, correction, search, report and documentation
 read it from there, so an effect that is added here works in all of them. Its contribution to the
@@ -39,9 +39,7 @@ from .catalogue import (
 from .form import (
     AFFINE, AXES, by_axis, Context, CUBE, Effect, EffectKey, EffectRecord, fitted_places, FORCE,
     MONOMIALS, ODD_SQUARE, ONE, PRODUCT, SIZE, SQUARE, TO_SEPARATE, WAVE, ZONAL, ZONES)
-from .history import (
-    add_acting, add_history, context_of_samples, FROM_TEMPERATURE, model_with, parse_effect,
-    simulate_poses, simulate_recording, thermal_stream, turn_between)
+from .history import add_acting, add_history, context_of_samples, FROM_TEMPERATURE, thermal_stream
 from .model import (
     check_context, CONVERGED_G, correct, EachShape, factors_of, LARGEST_FORCE_G,
     LARGEST_ITERATIONS, length_rows, linear_model, Model, own_slope, predict, sensor_force,
@@ -51,6 +49,7 @@ from .records import (
     CARRIERS, Covariate, COVARIATES, curves_over, effect_named, EMPIRICAL, EmpiricalCurve,
     formula_of, kind_of, modes_of, shown_name, unchanged, unit_of, value_unit, variable_of,
     variable_words, VARIABLES)
+from .simulate import model_with, parse_effect, simulate_poses, simulate_recording, turn_between
 from .thermal import acting_temperature, between_steps, covariance_of_steps, rate_at, ThermalStream
 
 __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CATALOGUE', 'CHANGES', 'CONVERGED_G', 'COVARIATES',

@@ -28,8 +28,9 @@ from .catalogue import CATALOGUE, entry_of
 from .form import (
     ALL_AXES, AXES, by_axis, Context, CROSS, DEGREES, Effect, EffectKey, EffectRecord, FORCE,
     MODES, ONE, Term, WAVE, ZONAL, ZONES)
+from ..statistics import rms_of_rows
 from ..table import column_of, CONTEXT, Floats, is_quantity
-from ..units import MG, rms_of_rows
+from ..units import MG
 
 EMPIRICAL = 'empirical'
 """Kind of a smooth curve without a physical cause."""

@@ -178,6 +178,7 @@ def covariance_of_steps(time: Floats, temperature: Floats, onto: Floats) -> Floa
 
 
 def _steps_of(time: Floats, temperature: Floats) -> _Steps | None:
+    """Return the temperatures in steps; None if they are not, or at too few moments."""
     known = np.isfinite(time) & np.isfinite(temperature)
     values = temperature[known]
     different, count = np.unique(values, return_counts=True)
@@ -191,7 +192,13 @@ def _steps_of(time: Floats, temperature: Floats) -> _Steps | None:
             or len(moments) < _LEAST_MOMENTS):
         return None
     variance = step ** 2 / 12.0 / np.bincount(place)
-    apart, best = np.diff(moments) / np.median(np.diff(moments)), -np.inf
+    return _Steps(step, known, place, variance, *_spline(moments, mean, variance))
+
+
+def _spline(time: Floats, mean: Floats, variance: Floats
+            ) -> tuple[tuple[Floats, Floats, Floats], Floats, Floats]:
+    """Return `rows`, `root` and `mean` of `_Steps` from readings at n increasing times."""
+    apart = np.diff(time) / np.median(np.diff(time))
     size, first, last = len(mean) - 2, 1.0 / apart[:-1], 1.0 / apart[1:]
     middle = -first - last
     of_error, of_process = np.zeros((2, 3, size))  # diagonals of the lower triangle
@@ -202,17 +209,14 @@ def _steps_of(time: Floats, temperature: Floats) -> _Steps | None:
     of_error[2, :-2] = last[:-2] * first[2:] * variance[2:-2]
     of_process[0], of_process[1, :-1] = (apart[:-1] + apart[1:]) / 3.0, apart[1:-1] / 6.0
     across = first * mean[:-2] + middle * mean[1:-1] + last * mean[2:]
-    for change in _CHANGES * np.max(variance):
-        tried = scipy.linalg.cholesky_banded(of_error + change * of_process, lower=True)
-        off = scipy.linalg.cho_solve_banded((tried, True), across)
-        likelihood = -float(np.sum(np.log(tried[0])) + across @ off / 2.0)
-        if likelihood > best:
-            best, root, solved = likelihood, tried, off
-    moved = np.zeros(len(mean))
+    roots = [scipy.linalg.cholesky_banded(of_error + change * of_process, lower=True)
+             for change in _CHANGES * np.max(variance)]
+    root = max(roots, key=lambda root: -np.sum(np.log(root[0])) - across @
+               scipy.linalg.cho_solve_banded((root, True), across) / 2.0)
+    solved, moved = scipy.linalg.cho_solve_banded((root, True), across), np.zeros(len(mean))
     for k, row in enumerate((first, middle, last)):
         moved[k:size + k] += row * solved
-    return _Steps(step, known, place, variance, (first, middle, last), root,
-                  mean - variance * moved)
+    return (first, middle, last), root, mean - variance * moved
 
 
 def _smoothed_rate(time: Floats, temperature: Floats) -> Floats:

@@ -58,8 +58,9 @@ import scipy
 
 from ..effects import Context, EachShape, EffectKey, Model, terms_of, times
 from ..geometry import unit
+from ..statistics import NORMAL_95, over_axes, STATED_NOISE
 from ..table import Poses
-from ..units import Floats, Indices, NORMAL_95, over_axes, STATED_NOISE
+from ..units import Floats, Indices
 
 _BLOCK = 8192
 """Number of poses per block; their equations fit in the cache."""

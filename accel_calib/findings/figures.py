@@ -37,8 +37,9 @@ from ..effects import (
     value_unit)
 from ..estimate import pose_noise, sensing_axes, variance_factor
 from ..finding import NextStep, Rating
+from ..statistics import rms
 from ..text import signed
-from ..units import MG, rms
+from ..units import MG
 
 if TYPE_CHECKING:
     from ..refinement import Refinement

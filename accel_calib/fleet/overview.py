@@ -61,9 +61,9 @@ from ..report.sheet import (
     ACCENT, add_band, AFTER, BAND, BEFORE, Drawing, drawn, EDGE, FAINT, legend_below, Mark, Marks,
     page, THIRD, write_page)
 from ..report.stability import GROUPS, label_dates, named_words, places_of
+from ..statistics import SIGMA_OF_MAD
 from ..table import Floats
 from ..text import counted, short, with_minus
-from ..units import SIGMA_OF_MAD
 
 MOST_ERRORS = 200
 """Largest number of errors that are kept."""

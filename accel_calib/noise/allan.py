@@ -78,7 +78,8 @@ from numpy.typing import NDArray
 import scipy
 
 from ..errors import InputError
-from ..units import Floats, rms
+from ..statistics import rms
+from ..units import Floats
 
 FLAT = 2.0 * np.log(2.0) / np.pi
 """Allan variance of flicker noise in units of B²."""

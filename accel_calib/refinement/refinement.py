@@ -281,7 +281,8 @@ def _with_steps(final: State, poses: Poses) -> State:
     Return a state with what a thermometer with steps adds to its covariance.
 
     To first order, the errors dT of the temperatures at the poses move the values by
-    -J⁺ (∂reading/∂T dT), with J the derivative of the equations.
+    -J⁺ (∂reading/∂T dT), with J the derivative of the equations. Of poses that share an
+    orientation, this is without the part that a turn of all of them explains.
 
     """
     fit, model = final.fit.beside or final.fit, final.model
@@ -295,7 +296,8 @@ def _with_steps(final: State, poses: Poses) -> State:
     onto, order = np.zeros((len(poses), fit.columns.shape[1])), np.argsort(poses.row)
     place = np.searchsorted(poses.row, fit.poses_g.row[near.pose], sorter=order)
     own = place < len(poses)  # not the poses of a stored calibration
-    np.add.at(onto, order[place[own]], (np.linalg.pinv(fit.columns) * rows).T[own])
+    np.add.at(onto, order[place[own]],
+              (fit.columns @ fit.by_pose.spread * rows[:, np.newaxis])[own])
     spread = covariance_of_steps(poses['time'], poses['temperature'], onto.T)
     return State(replace(final.fit, of_context=fit.ties @ spread @ fit.ties.T))
 

@@ -42,9 +42,10 @@ from ..effects import (
     Model, MODELS)
 from ..estimate import estimate, Fit, judge, kinds, left_out, NotConvergedError
 from ..geometry import unit
+from ..statistics import rms
 from ..stillness import rounding_left
 from ..table import Floats, Poses
-from ..units import MG, rms
+from ..units import MG
 
 WORTH = 4.0
 """ν, degrees of freedom that the measured noise counts as."""

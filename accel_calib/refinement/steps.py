@@ -36,8 +36,9 @@ from ..effects import (
     unchanged, variable_of, WANDER)
 from ..estimate import Fit, kinds
 from ..geometry import ATTITUDES
+from ..statistics import rms
 from ..table import column_of, Floats, Poses
-from ..units import MG, rms
+from ..units import MG
 
 MOST_RIVALS = 3
 """Largest number of rivals of an effect that is called the explanation."""

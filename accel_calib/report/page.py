@@ -44,9 +44,10 @@ from ..findings import (
 from ..geometry import coverage
 from ..pipeline import ThermalOutcome
 from ..refinement import named_entries, Refinement
+from ..statistics import over_axes, rms
 from ..table import Floats, Poses
 from ..text import counted, milli, short, signed, with_minus
-from ..units import MG, over_axes, rms
+from ..units import MG
 
 STORED = 'calibration.yaml'
 """Name of the file of the calibration in the lines that use it, if it is not known."""

@@ -24,9 +24,10 @@ from ..effects import (
     acting_temperature, add_history, AXES, EffectKey, entry_of, rate_at, sensor_force)
 from ..geometry import uncovered, unit
 from ..refinement import Refinement
+from ..statistics import over_axes, rms
 from ..table import column_of, Floats, Poses
 from ..text import milli, short, with_minus
-from ..units import MG, over_axes, rms
+from ..units import MG
 
 _CONTEXT = ('temperature', 'time', 'supply_voltage', 'std', 'rate')
 

@@ -37,9 +37,9 @@ from .. import __version__
 from ..disk import write_atomically
 from ..errors import InputError
 from ..findings import Rating
+from ..statistics import NORMAL_95
 from ..table import Floats
 from ..text import counted, short, table
-from ..units import NORMAL_95
 
 if TYPE_CHECKING:
     from jinja2 import Environment

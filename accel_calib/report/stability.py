@@ -27,9 +27,10 @@ from ..comparison import Comparison, History
 from ..findings import (
     change_words, CROSS, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, Rating, scale_of)
 from ..noise import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
+from ..statistics import rms
 from ..table import Floats
 from ..text import short, with_minus, with_sd
-from ..units import is_native, rms
+from ..units import is_native
 
 _LOOKS = dict(zip('xyz', zip(AXIS_COLOURS, 'os^')))
 """Colour and marker of each axis."""

@@ -50,10 +50,11 @@ from .run import own_domain, started
 from ..effects import parse_effect
 from ..errors import AccelCalibError, InputError
 from ..session import Progress
+from ..statistics import rms
 from ..stored import read_calibration
 from ..table import Floats
 from ..text import counted
-from ..units import MG, rms, STANDARD_GRAVITY
+from ..units import MG, STANDARD_GRAVITY
 
 
 @contextmanager

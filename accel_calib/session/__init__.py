@@ -6,11 +6,10 @@ The calibrator without ROS: it takes samples and commands, and returns answers a
 
 `session` is the entry point, and `state` what all other modules read. `commands` contains what the
 user can ask for, and `use` their computations and what follows when the calibration or the poses
-change.
-`poses` captures poses and chooses the next one. `stream` describes the messages. `conditions` is
-what is the case, the next step, and how topics and pages show them. `store` manages and locks
-files. `worker` runs the tasks and defines the events. `settings` defines the parameters. Imports
-point one way.
+change. `poses` captures poses and chooses the next one. `stream` describes the messages.
+`conditions` is what is the case, the next step, and how topics and pages show them. `store`
+manages and locks files. `worker` runs the tasks and defines the events. `settings` defines the
+parameters. Imports point one way.
 
 """
 

@@ -61,9 +61,9 @@ from .rule import (
     DWELL_SLOPE_G, HORIZON, RELATIVE, rounding_left, Rule, STRENGTH, SURE, TURN_G, WEAK_STRENGTH)
 from .trend import excess_of_means, lines, strength_of
 from ..finding import Finding
+from ..statistics import SIGMA_OF_MAD
 from ..table import Floats
 from ..text import counted
-from ..units import SIGMA_OF_MAD
 
 REASONS: Mapping[str, tuple[str, str]] = {
     'zeros': ('samples are missing: they are 0 on all axes', 'check the driver and the cable'),

@@ -58,8 +58,9 @@ from numpy.typing import NDArray
 
 from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records
 from .trend import oscillation, sliding, Stretch, stretch, window_figures
+from ..statistics import rms
 from ..table import Floats
-from ..units import rms, Units
+from ..units import Units
 
 LONG = 12
 """Number of chunks from which the noise is estimated."""

@@ -38,9 +38,10 @@ from ..errors import (
 from ..estimate import Prior
 from ..finding import Finding, KINDS, LEVELS, without
 from ..findings import mounting_figures
+from ..statistics import rms
 from ..table import Autopilot, check_values, COLUMNS, Floats, is_quantity, LARGEST, Poses
 from ..text import counted, LONGEST_NAME, plain, some
-from ..units import FRAMES, MODEL_NAMES, rms, UNIT_NAMES, Units
+from ..units import FRAMES, MODEL_NAMES, UNIT_NAMES, Units
 
 # The first is eight times as fast, but not in every build of PyYAML.
 SafeDumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
