@@ -91,6 +91,18 @@ def test_poses_are_captured_and_removed_on_request(bench: Any, readings: Reading
     assert not bench.call('undo_pose').success
 
 
+def test_poses_are_drawn_for_a_listener_who_comes_later(bench: Any, readings: Readings) -> None:
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    bench.calibrator(passthrough=True)
+    bench.feed(readings([[0, 0, 1], [1, 0, 0]], dwell=3.0))
+    bench.spin(lambda: diagnostics and any((value.key, value.value) == ('poses captured', '2')
+                                           for value in diagnostics[-1].status[0].values))
+    known = len(diagnostics)
+    bench.spin(lambda: len(diagnostics) > known + 2)  # nothing more is to be drawn
+    markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
+    bench.spin(lambda: count(markers) == 2)
+
+
 def test_self_test_names_what_fails(bench: Any, stored: Stored) -> None:
     rng = np.random.default_rng(1)
 

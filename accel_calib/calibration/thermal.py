@@ -276,12 +276,10 @@ class _Board:
             onto = np.linalg.pinv(design)[levels.shape[2]:]
             vector = model.vector.copy()
             vector[model.fitted] += onto @ (reading - self.predicted(model)).T.ravel()
-            found = with_vector(model.effects, vector)
             if model.lags:  # stay positive
-                before = model.values[_LINEAR][3]
-                found.values[_LINEAR][3] = np.clip(
-                    found.values[_LINEAR][3], 0.5 * before, 2.0 * before)
-            model = found
+                lag = model.terms.parts[model.effects.index(_LINEAR)].start + 3
+                vector[lag] = np.clip(vector[lag], *(model.vector[lag] * np.array([0.5, 2.0])))
+            model = with_vector(model.effects, vector)
         covariance = np.zeros((len(model.vector),) * 2)
         covariance[np.ix_(model.fitted, model.fitted)] = self._covariance(
             np.column_stack([self.levels, self.columns({

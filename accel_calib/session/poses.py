@@ -61,7 +61,7 @@ _LOOK_EVERY = 0.1
 """Interval at which an ongoing rest is checked [s]."""
 
 _PIECE = 0.6
-"""Length, by the stamps, of the pieces into which a block is divided [s]; more than a batch has."""
+"""Length, by the stamps, of the pieces of a block [s]; more than that of a batch."""
 
 _NOISE_FELL = 0.9
 """Relative decrease of the threshold after which earlier poses are tested again."""
