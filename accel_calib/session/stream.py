@@ -231,8 +231,9 @@ class Around:
         """Take a value that has arrived; one that is not finite is ignored."""
         if math.isfinite(value):
             self._came[column] = self._clock()
-            self.values = {**self.values, column: value}
-            self.filled = {**self.assumed, **self.values}
+            if value != self.values.get(column):
+                self.values = {**self.values, column: value}
+                self.filled = {**self.assumed, **self.values}
 
     def is_missing(self, column: str) -> bool:
         """Return whether nothing has arrived for too long."""
