@@ -7,13 +7,13 @@ The server of the live page, on its own thread with its own event loop.
 **Who may.** Everybody who reaches the server can look. Commands and exports need the token in the
 fragment of the link, which browsers do not send. If there are too many viewers, one with the token
 takes the place of one without it. If there are too many connections, one ends of the address that
-has most of them, and the oldest of those that have got least far; of the owner, only the last. So
-nobody can keep the owner out. Host and Origin are
-checked, so that a page of another site cannot use the server through the browser of a user. Files
-come from a fixed list.
+has most of them: the oldest that has not said hello, before one that looks, and the owner last. A
+newcomer is thus not ended before those that had longer, and nobody can keep the owner out. Host
+and Origin are checked, so that a page of another site cannot use the server through the browser of
+a user. Files come from a fixed list.
 
 A connection is for one request. It is closed unless the request arrives within `_REQUEST_S`. A
-viewer is a connection that has become a WebSocket.
+viewer is a connection that has become a WebSocket and said hello.
 
 """
 
@@ -52,8 +52,8 @@ if TYPE_CHECKING:
 _REQUEST_S = 10.0
 """Time within which a connection must send its request [s]."""
 
-OWNER = 3
-"""Stage of a connection whose viewer has the token."""
+VIEWER, OWNER = 2, 3
+"""Stages of a connection that has said hello, without and with the token."""
 
 PAGE = Path(__file__).with_name('page') / 'index.html'
 """The page; what it loads is in the same folder."""
@@ -63,7 +63,10 @@ _VIEWERS = 16
 
 _CONNECTIONS = 128
 """Largest number of connections: of viewers, and of requests that arrive or are answered. It is
-larger than the number that asyncio accepts at once (100), so that a request is read first."""
+several times `_BACKLOG`, so that a request and the hello are read before others take the place."""
+
+_BACKLOG = 16
+"""Largest number of connections that are accepted at once; others wait in the system."""
 
 _QUIET_S = 60.0
 """Shortest time between two log lines about the same misuse [s]."""
@@ -88,7 +91,7 @@ class Connection(web.RequestHandler):
     """
     A connection from an `address`.
 
-    `stage` 0: its request has not arrived; 1: it is answered; 2: a viewer; 3: the `OWNER`.
+    `stage` 0: its request has not arrived; 1: it is answered; 2: a `VIEWER`; 3: the `OWNER`.
 
     """
 
@@ -107,7 +110,7 @@ class Connection(web.RequestHandler):
             self._owner.report(f'ended a connection, because {_CONNECTIONS} were open')
             of = Counter(each.address for each in everyone)
             ended = max(everyone, key=lambda each: (
-                each.stage < OWNER, of[each.address], -each.stage))
+                each.stage < OWNER, of[each.address], each.stage < VIEWER))
             del everyone[ended]
             ended.abort()
         everyone[self] = None
@@ -239,7 +242,7 @@ class PageServer:
         http = web.Server(self._answer)
         try:
             listener = await loop.create_server(
-                lambda: Connection(self, http), self._host, self._port)
+                lambda: Connection(self, http), self._host, self._port, backlog=_BACKLOG)
         except Exception as error:  # `start` raises it, in its own thread
             started.set_exception(error)
             return
@@ -261,7 +264,7 @@ class PageServer:
                 await asyncio.wait_for(self._over.wait(), PERIOD if self.viewers else _RARELY_S)
         listener.close()
         for connection in list(self.connections):
-            if connection.stage > 1:
+            if connection.stage >= VIEWER:
                 connection.abort()
         await http.shutdown(_ENDING_S)
 
@@ -362,7 +365,6 @@ class PageServer:
         if not is_one:
             return secured(web.Response(status=400, text='expected a WebSocket; open /\n'))
         await socket_.prepare(request)
-        connection.stage = 2
         viewer = Viewer(self.board, socket_, connection.abort,
                         lambda command: self._ask(partial(self.exchange.ask, command)))
         try:
@@ -387,6 +389,5 @@ class PageServer:
                                    'them')
             guests[0].abort()
             del self.viewers[guests[0]]
-        if not viewer.why:
-            connection.stage = OWNER
+        connection.stage = VIEWER if viewer.why else OWNER
         self.viewers[viewer] = connection
