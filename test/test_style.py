@@ -5,7 +5,6 @@
 
 import ast
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 import re
 
@@ -85,8 +84,9 @@ def module_of(name: str) -> str:
 def is_on_a_face(name: str) -> bool:
     """Return whether a full name is a base module or a face, or is exported by one."""
     module, _, what = name.rpartition('.')
-    return name in BASE | FACES or module in BASE or (
-        module in FACES and what in getattr(import_module(module), '__all__', ()))
+    face = imports_of(PACKAGE.joinpath(*module.split('.')[1:], '__init__.py'))
+    return name in BASE | FACES or module in BASE or (module in FACES and any(
+        each.startswith('accel_calib.') and each.endswith(f'.{what}') for each in face))
 
 
 def strings_of(path: Path) -> Iterator[str]:

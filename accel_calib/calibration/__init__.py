@@ -1,5 +1,6 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
+# flake8: noqa: F401
 
 """
 From poses to a calibration.
@@ -32,19 +33,3 @@ from .quality import (
     uncertainty_g, Verification, verify, with_rest_noise)
 from .rest_noise import gyro_bias_of, gyro_bias_of_rest, GyroBias, sample_noise_of, SampleNoise
 from .thermal import Curve, curve_of, thermal_alone, with_curve, without_curve
-
-__all__ = ['CLIPPED', 'ENOUGH', 'FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MODELS',
-           'OF_A_FIT', 'ORIENTED', 'PRIOR', 'STORED_METHODS', 'Calibration', 'Combination',
-           'Curve', 'FleetPrior', 'GyroBias', 'Identifiability', 'NextPose', 'Outside',
-           'PlannedPose', 'PosePlan', 'Quality', 'Rejected', 'RejectedKind', 'SampleNoise',
-           'SessionPlan', 'Verification', 'check_sensor', 'curve_of', 'determines', 'deviations_g',
-           'dilution', 'directions_in', 'directions_of', 'error_left_in', 'errors_after',
-           'errors_before', 'fit_findings', 'fit_partial', 'fit_poses', 'fit_unknown',
-           'fit_with_fleet', 'flat_direction', 'free_parameters', 'gated', 'gyro_bias_of',
-           'gyro_bias_of_rest', 'has_usual_gains', 'identifiability', 'in_frame', 'in_g', 'level',
-           'level_by_rows', 'lies_in_cone', 'lies_in_plane', 'mounting_only', 'next_pose',
-           'on_topics', 'only_norm', 'outside', 'plan_refinement', 'plan_session', 'posterior',
-           'quality_of', 'record_of', 'refuse_if_unfit', 'rejected_by', 'sample_noise_of',
-           'set_heading', 'sound_rows', 'stated_uncertainty', 'sure_rows', 'thermal_alone',
-           'uncertainty_g', 'verify', 'with_curve', 'with_given_mounting', 'with_rest_noise',
-           'without_curve']

@@ -1,5 +1,6 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
+# flake8: noqa: F401
 
 """
 Whether a sensor has changed: comparison of repeated calibrations, and of rests with a calibration.
@@ -12,9 +13,5 @@ the calibrations. `drift` compares every rest with the calibration in use.
 """
 
 from .agreement import LEVEL, NAMES, rotation_free
-from .comparison import compare, Comparison, DatedChange, History, history_of, Moment, Parameter
+from .comparison import compare, Comparison, History, history_of, Parameter
 from .drift import compared, Drift, rest_errors, status
-
-__all__ = ['LEVEL', 'NAMES', 'Comparison', 'DatedChange', 'Drift', 'History', 'Moment',
-           'Parameter', 'compare', 'compared', 'history_of', 'rest_errors',
-           'rotation_free', 'status']

@@ -1,5 +1,6 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
+# flake8: noqa: F401
 
 """
 The rating of a result: GOOD, USABLE or BAD, with the reason and what to do next.
@@ -23,21 +24,12 @@ it must not be used. All limits are in `LIMITS`.
 """
 
 from .figures import (
-    calibration_json, change_words, CROSS, effect_figures, Expected, Figure, figures_of, GAINS,
-    GOOD_MG, in_words, Limit, LIMITS, linear_figures, OFFSETS, Outlook, outlook, rating_json,
-    refinement_json, residual_figures, scale_of)
+    calibration_json, change_words, CROSS, effect_figures, Expected, figures_of, GAINS, GOOD_MG,
+    in_words, LIMITS, linear_figures, OFFSETS, Outlook, outlook, rating_json, refinement_json,
+    residual_figures, scale_of)
 from .rating import rate, rate_comparison, rate_fleet, rate_noise, rate_verification
 from .words import (
     advice_lines, angle_words, base_words, chance_words, difference_words, mounting_figures,
     mounting_words, NOTHING_TO_PLAN, odds_words, outside_words, place_words, plan_lines,
     request_words, rival_words, short_verdict, USES_LIMIT, value_words, verdict_words)
 from ..finding import Rating
-
-__all__ = ['CROSS', 'GAINS', 'GOOD_MG', 'LIMITS', 'NOTHING_TO_PLAN', 'OFFSETS', 'USES_LIMIT',
-           'Expected', 'Figure', 'Limit', 'Outlook', 'Rating', 'advice_lines', 'angle_words',
-           'base_words', 'calibration_json', 'chance_words', 'change_words', 'difference_words',
-           'effect_figures', 'figures_of', 'in_words', 'linear_figures', 'mounting_figures',
-           'mounting_words', 'odds_words', 'outlook', 'outside_words', 'place_words', 'plan_lines',
-           'rate', 'rate_comparison', 'rate_fleet', 'rate_noise', 'rate_verification',
-           'rating_json', 'refinement_json', 'request_words', 'residual_figures', 'rival_words',
-           'scale_of', 'short_verdict', 'value_words', 'verdict_words']

@@ -1,5 +1,6 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
+# flake8: noqa: F401
 
 """
 Noise figures from a long rest, by Allan deviation.
@@ -12,6 +13,3 @@ noise, bias instability and random walk to them.
 
 from .allan import AxisNoise, check_allantools, FIGURES, Kind, NoiseFigures
 from .figures import duration, noise_of, shown_unit, to_json, TYPICAL, whole, WORDS
-
-__all__ = ['FIGURES', 'TYPICAL', 'WORDS', 'AxisNoise', 'Kind', 'NoiseFigures', 'check_allantools',
-           'duration', 'noise_of', 'shown_unit', 'to_json', 'whole']

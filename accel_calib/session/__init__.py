@@ -1,5 +1,6 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
+# flake8: noqa: F401
 
 """
 The calibrator without ROS: it takes samples and commands, and returns answers and events.
@@ -25,11 +26,3 @@ from .stream import Around
 from .worker import (
     Answer, answered, CallSoon, Compute, Event, Files, Log, Mounting, nothing, Result, Severity,
     ShowPoses, Step, Still, Task, Throttle, Worker, WorkerProcess)
-
-__all__ = ['APART', 'BATCH', 'BUTTONS', 'COMMANDS', 'WEB_PORT', 'Answer', 'Around',
-           'CalibratorSettings', 'CallSoon', 'Check', 'Compute', 'Event', 'Files', 'Log',
-           'Mounting', 'Progress', 'Result', 'Session', 'Settings', 'Severity', 'ShowPoses',
-           'Step', 'Still', 'Surroundings', 'Task', 'Throttle', 'Worker', 'WorkerProcess',
-           'answered', 'changed', 'columns_of', 'conditions', 'diagnostics', 'enable', 'expected',
-           'figures', 'next_step', 'nothing', 'parameter', 'progress', 'ros_home', 'run', 'title',
-           'words_of_state']

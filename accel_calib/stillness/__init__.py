@@ -1,5 +1,6 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
+# flake8: noqa: F401
 
 """
 From samples to still poses. The node and recordings use the same rule.
@@ -20,9 +21,3 @@ from .dwell import account_of, Dwell, Rest
 from .ramp import cells_of, is_turned_over, LEAST_RANGE, LEAST_RESTS, Ramp, ramp_of, rests_in_cells
 from .rule import rounding_left
 from .sensor import check_axes, check_measured, is_one_direction
-
-__all__ = ['LEAST_RANGE', 'LEAST_RESTS', 'REPEATED', 'CaptureSettings', 'Captured', 'Dwell',
-           'Ramp', 'Repeated', 'Rest', 'StillDetector', 'account_of', 'capture', 'cells_of',
-           'check_axes', 'check_measured', 'dwells_of', 'is_one_direction', 'is_turned_over',
-           'overlap', 'poses_from', 'ramp_of', 'rest_after', 'rests_in_cells', 'rounding_left',
-           'samples_of', 'select', 'settings_from', 'with_temperature']
