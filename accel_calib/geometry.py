@@ -164,19 +164,11 @@ def distinct(directions: Floats) -> int:
     return len(np.unique(orientations_of(directions)))
 
 
-@dataclass(frozen=True)
-class Cone:
-    """The mean direction of poses, a (3,) unit vector, and their largest angle from it [°]."""
-
-    axis: Floats
-    degrees: float
-
-
-def cone_of(directions: Floats) -> Cone:
-    """Return the mean of (n, 3) unit vectors, n >= 1, and their largest angle from it."""
+def cone_of(directions: Floats) -> tuple[Floats, float]:
+    """Return the mean of (n, 3) unit vectors, n >= 1, and their largest angle from it [°]."""
     axis = unit(directions.mean(axis=0)[np.newaxis])[0]
     cosine = float(np.clip(np.min(directions @ axis), -1.0, 1.0))
-    return Cone(axis, float(np.degrees(np.arccos(cosine))))
+    return axis, float(np.degrees(np.arccos(cosine)))
 
 
 def words_of(signs: Floats) -> str:

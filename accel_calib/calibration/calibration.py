@@ -118,7 +118,7 @@ class Calibration(Record):
     name : str
         Name of the fitted model: 4, 7, 9, 10, 12 or ``ideal``.
     method : str
-        ``ml``, ``algebraic``, or ``prior`` (`accel_calib.calibration.partial`).
+        One of `STORED_METHODS`.
     model : Model
         The effects with their values, and ΔR.
     units : Units
@@ -299,7 +299,7 @@ class Calibration(Record):
         """Return the standard deviation of W, (3, 3)."""
         return self._linear_sd[:, 1:] * (self.units.per_g / self.force_per_g)
 
-    @property
+    @cached_property
     def _linear_sd(self) -> Floats:
         """(3, 4) array, standard deviation of V [g] and of the columns of W."""
         model, effects = self.model, self.model.terms.effects

@@ -265,7 +265,7 @@ def directions_in(poses: Poses, calibration: Calibration) -> Floats:
 
 def lies_in_cone(directions: Floats) -> bool:
     """Return whether (n, 3) unit vectors are those of a robot that cannot be turned over."""
-    return bool(len(directions) and cone_of(directions).degrees <= _CONE)
+    return bool(len(directions) and cone_of(directions)[1] <= _CONE)
 
 
 def lies_in_plane(directions: Floats) -> bool:
@@ -286,9 +286,9 @@ def shape_words(name: str, directions: Floats) -> str:
         return f'{count} poses'
     if determines(name, directions):
         return f'some of the {count} poses are too noisy'
-    cone = cone_of(directions)
-    if cone.degrees < _WIDE:
-        return f'the {count} poses lie within {cone.degrees:.0f}° of one direction'
+    _, degrees = cone_of(directions)
+    if degrees < _WIDE:
+        return f'the {count} poses lie within {degrees:.0f}° of one direction'
     if lies_in_plane(directions):
         return f'the {count} poses lie in a plane'
     return (f'the {count} poses have {distinct(directions)} directions that leave a region of '

@@ -338,12 +338,13 @@ def _words_of_part(calibration: Calibration) -> tuple[str, Finding]:
     """Return what the poses of a part of the sphere determine, and what they leave open."""
     model, covariance = calibration.model, calibration.covariance
     up = unit(sensor_force(model, calibration.units.to_g(calibration.used_poses.reading), {}))
-    count, cone, deviation = len(up), cone_of(up), np.sqrt(np.diag(covariance))
+    count, (axis, widest), deviation = len(up), cone_of(up), np.sqrt(np.diag(covariance))
     place = dict(zip(model.effects, model.terms.parts, strict=True))
     offset = covariance[place['offset'], place['offset']]
     at_each = _mg(float(np.max(deviations_g(calibration, up))))
     in_plane = lies_in_plane(up)
-    axis = np.linalg.svd(up - up.mean(axis=0))[2][2] if in_plane else cone.axis
+    if in_plane:
+        axis = np.linalg.svd(up - up.mean(axis=0))[2][2]
     flat = np.eye(3) - np.outer(axis, axis)  # projects to right angles to the axis
     beside = float(np.sqrt(np.linalg.eigvalsh(flat @ offset @ flat)[-1]))
     if in_plane:
@@ -354,7 +355,7 @@ def _words_of_part(calibration: Calibration) -> tuple[str, Finding]:
         reason = ('along gravity the sum of offset and gain, and so |a|, is known to '
                   f'{_mg(float(deviations_g(calibration, shown)[0]))}')
         reason = f'1 pose: {reason}' if count == 1 else (
-            f'the {count} poses lie within {cone.degrees:.0f}° of one direction: {reason}, and at '
+            f'the {count} poses lie within {widest:.0f}° of one direction: {reason}, and at '
             f'each pose |a| to {at_each}')
         moved = flat @ np.linalg.solve(model.linear_part[0], model.basis(shown, {}).full[0])
         degrees = np.degrees(np.sqrt(np.linalg.eigvalsh(moved @ covariance @ moved.T)[-1]))

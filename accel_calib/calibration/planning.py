@@ -44,10 +44,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .calibration import ORIENTED
 from .directions import (
@@ -395,16 +393,7 @@ def plan_refinement(rivals: Sequence[Mapping[EffectKey, tuple[float, Fit]]], mod
     """
     if not rivals:
         return PosePlan()
-    needs = {key for each in rivals for name in each for key in entry_of(name).needs}
-    varied = [key for key in (*VARIED, *sorted(filter(is_quantity, needs))) if key in needs]
-    directions = np.vstack([ATTITUDES, spread_directions(200)])
-    settings = [dict(zip(varied, each, strict=True))  # those that are easier to set come first
-                for each in product(*(choose_levels(key, poses_g) for key in varied))]
-    up = np.tile(directions, (len(settings), 1))
-    shown = [setting for setting in settings for _ in directions]
-    columns = _columns(poses_g, up, shown)
-    columns['reading'] = model.at(columns).reading(up)
-    candidates = Poses(columns, np.arange(1, len(up) + 1))
+    up, shown, candidates = _candidates(rivals, model, poses_g)
     contests = []
     for each in rivals:
         judged = [judge(fit.model, candidates) for _, fit in each.values()]
@@ -512,10 +501,17 @@ def choose_levels(key: str, poses_g: Poses) -> list[float]:
     return [float(np.median(values)), high] if key == 'std' else [middle, low, high]
 
 
-def _columns(poses_g: Poses, force: Floats, shown: Sequence[Mapping[str, float]]
-             ) -> dict[str, NDArray[Any]]:
-    """Return the columns of candidates, without their readings."""
-    count, found = len(force), {}
+def _candidates(rivals: Sequence[Mapping[EffectKey, tuple[float, Fit]]], model: Model,
+                poses_g: Poses) -> tuple[Floats, list[dict[str, float]], Poses]:
+    """Return the (c, 3) directions of up of all candidates, what else is set, and their poses."""
+    needs = {key for each in rivals for name in each for key in entry_of(name).needs}
+    varied = [key for key in (*VARIED, *sorted(filter(is_quantity, needs))) if key in needs]
+    directions = np.vstack([ATTITUDES, spread_directions(200)])
+    settings = [dict(zip(varied, each, strict=True))  # those that are easier to set come first
+                for each in product(*(choose_levels(key, poses_g) for key in varied))]
+    up = np.tile(directions, (len(settings), 1))
+    shown = [setting for setting in settings for _ in directions]
+    count, found = len(up), {'previous': -up}  # turned from the opposite attitude
     for key in ('std', 'count', 'temperature', 'supply_voltage', 'rate', 'duration', 'since_turn',
                 *poses_g.quantities):
         if key in poses_g:
@@ -532,7 +528,8 @@ def _columns(poses_g: Poses, force: Floats, shown: Sequence[Mapping[str, float]]
         found.update(temperature_rate=np.zeros(count), temperature_of_offset=found['temperature'],
                      temperature_of_gain=found['temperature'])
     if len(kinds(poses_g)[0]):
-        found['reference'] = force
+        found['reference'] = up
     if 'new' in poses_g:
         found['new'] = np.ones(count)
-    return {**found, 'previous': -force}  # turned from the opposite attitude
+    found['reading'] = model.at(found).reading(up)
+    return up, shown, Poses(found, np.arange(1, count + 1))

@@ -376,12 +376,12 @@ def _check_plausible(calibration: Calibration) -> None:
     if not (offset <= LARGEST_OFFSET_G or calibration.units.is_native):
         raise RefusedFitError(f'the zero-g offset is {offset:.3g} g, expected less than '
                               f'{LARGEST_OFFSET_G:g} g', _CHECK_POSES)
-    used_g = in_g(calibration.used_poses, calibration.units)
-    up = unit(used_g.reading)
     for name, values in calibration.model.values.items():
-        model = Model({name: values})
-        effect = model.terms.effects[0]
-        if name in LADDER or effect.output is not None or not len(used_g) or any(
+        if name in LADDER:
+            continue
+        used_g, model = in_g(calibration.used_poses, calibration.units), Model({name: values})
+        up, effect = unit(used_g.reading), model.terms.effects[0]
+        if effect.output is not None or not len(used_g) or any(
                 key not in used_g for key in model.needs if key != 'previous'):
             continue
         along = model.at({'previous': up, **used_g.columns}).reading(up)
