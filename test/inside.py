@@ -96,7 +96,8 @@ from accel_calib.session.use import adopt as use_calibration, fit as fit_in_node
 from accel_calib.session.worker import Worker, WorkerProcess
 from accel_calib.stillness import rest_after, rounding_left, with_temperature
 from accel_calib.stillness.chunks import repeated_extremes
-from accel_calib.stillness.trend import _long_run as long_run, excess_of_means, lines, oscillation
+from accel_calib.stillness.trend import (
+    _long_run as long_run, excess_of_means, oscillation, trend_of)
 from accel_calib.stored import calibration_yaml, plain_yaml
 from accel_calib.stored.calibration_yaml import calibration_bytes, calibration_from
 from accel_calib.stored.exports import (

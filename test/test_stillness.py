@@ -11,7 +11,7 @@ from accel_calib.stillness import (
     capture, Captured, CaptureSettings, poses_from, select, StillDetector)
 from accel_calib.units import units_of
 from inside import (
-    excess_of_means, lines, long_run, Model, oscillation, repeated_extremes, simulate_recording)
+    excess_of_means, long_run, Model, oscillation, repeated_extremes, simulate_recording, trend_of)
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
@@ -319,16 +319,22 @@ def test_a_dwell_that_is_not_still_according_to_later_ones_is_doubtful():
     assert start < 1.0
 
 
-def test_lines_through_series_are_those_of_least_squares():
-    values = np.random.default_rng(4).normal(size=(3, 12))
-    line = lines(values, 12)
-    time = np.arange(12)
+def test_trends_are_those_of_least_squares():
+    values, white = np.random.default_rng(4).normal(size=(3, 12)), np.array([[0.1], [0.2], [0.3]])
+    found = trend_of(values, 12, 0.5, white)
+    time = 0.5 * np.arange(12)
     fitted = np.polyfit(time, values.T, 1)
     left = values.T - np.outer(time, fitted[0]) - fitted[1]
-    np.testing.assert_allclose(line.slope[:, 0], fitted[0])
-    np.testing.assert_allclose(line.square[:, 0], np.sum(left ** 2, axis=0))
-    np.testing.assert_allclose(line.neighbours[:, 0], np.sum(left[1:] * left[:-1], axis=0))
-    np.testing.assert_allclose(line.time_square, np.sum((time - time.mean()) ** 2))
+    np.testing.assert_allclose(found.slope[:, 0], fitted[0])
+    np.testing.assert_allclose(found.square[:, 0], np.sum(left ** 2, axis=0))
+    squares, neighbours = (np.sum(each / white.T) for each in (left ** 2, left[1:] * left[:-1]))
+    rho = min(max(neighbours / squares + 0.25, 0.0), 0.9)
+    excess = squares / 30.0 * (1.0 + rho) / (1.0 - rho)
+    spread = white / np.sum((time - time.mean()) ** 2)
+    assert squares > 30.0  # so that the power is not that of white noise
+    np.testing.assert_allclose(found.excess, [excess])
+    np.testing.assert_allclose(found.strength, np.sum(found.slope ** 2 / spread) / excess)
+    np.testing.assert_allclose(found.error, np.sqrt(np.max(spread)))
 
 
 def test_correlations_at_lags_of_half_a_series_and_more_are_not_used():

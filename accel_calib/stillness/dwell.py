@@ -59,7 +59,7 @@ from .chunks import (
     CaptureSettings, chained, chunk_type, Chunks, CHUNKS_PER_WINDOW, Records, summed)
 from .rule import (
     DWELL_SLOPE_G, HORIZON, RELATIVE, rounding_left, Rule, STRENGTH, SURE, TURN_G, WEAK_STRENGTH)
-from .trend import excess_of_means, lines, strength_of
+from .trend import excess_of_means, trend_of
 from ..finding import Finding
 from ..statistics import SIGMA_OF_MAD
 from ..table import Floats
@@ -144,14 +144,14 @@ def figures(dwell: OngoingDwell, *, known_units: bool) -> Records:
     centred = cells['first'][:, :3].T / cells['count']
     centred -= centred.sum(axis=1, keepdims=True) / size
     white = level[:3] / per_cell
-    trend = strength_of(lines(centred, size), spacing, white[:, np.newaxis])
+    trend = trend_of(centred, size, spacing, white[:, np.newaxis])
     found['slope'], found['strength'], found['error'] = (
         trend.slope.T, trend.strength, trend.error)
     half = size // 2
     parts = np.stack([centred[:, start:start + half]
                       for start in (0, (size - half) // 2, size - half)], axis=1)
     parts -= parts.sum(axis=2, keepdims=True) / half
-    trend = strength_of(lines(parts, half), spacing, white[:, np.newaxis, np.newaxis])
+    trend = trend_of(parts, half, spacing, white[:, np.newaxis, np.newaxis])
     found['part_slope'], found['part_strength'] = (
         np.sqrt(np.sum(trend.slope ** 2, axis=0)).T, trend.strength.T)
     white = variance / per_cell

@@ -390,8 +390,8 @@ class Rule:
             one_g = np.maximum(scale, np.sqrt(np.sum(mean[:3]**2, axis=0)))
         for length, each in seen.items():
             calm = np.all(each.highest <= limit[:3], axis=0)
-            moved = self.is_steep(each.trend.slope, scale, each.variance[:3])
-            moved &= each.trend.strength > STRENGTH
+            moved = self.is_steep(each.slope, scale, each.variance[:3])
+            moved &= each.strength > STRENGTH
             suspect = each.scatter > np.maximum((OSCILLATION_G * one_g)**2, each.white)
             suspect &= calm & (self._settings.still_std_max == 0.0)
             index = np.flatnonzero(suspect)
@@ -423,9 +423,9 @@ class Rule:
         floors[:, :, 0] = np.fmin(floors[:, :, 0], self._floors[:, :axes])
         floors = np.fmin.accumulate(floors, axis=2)
         deviation = np.sqrt(np.max(seen.variance[:3], axis=0))
-        calm = (seen.trend.excess < WHITE) & ~zero
-        calm &= ~((seen.trend.strength > STRENGTH) & self.is_steep(
-            seen.trend.slope, np.asarray(self.scale), seen.variance[:3]))
+        calm = (seen.excess[0] < WHITE) & ~zero
+        calm &= ~((seen.strength > STRENGTH) & self.is_steep(
+            seen.slope, np.asarray(self.scale), seen.variance[:3]))
         if self.known:
             calm &= deviation < STD_CAP_G * self._per_g
         varies = calm & ~repeated & (deviation > VARIED_STEPS * steps[0])
@@ -435,7 +435,7 @@ class Rule:
         self._seen += len(calm)
         counts = self._counts[:, np.newaxis] + np.cumsum([varies, repeated & ~zero], axis=1)
         same = np.maximum.accumulate(np.append(
-            self._same, np.where(seen.trend.excess < WHITE, seen.same, 0.0) * ~repeated))[1:]
+            self._same, np.where(seen.excess[0] < WHITE, seen.same, 0.0) * ~repeated))[1:]
         chance = same ** (seen.samples * CHUNKS_PER_WINDOW / LONG - 1.0)
         share = VARIED_SHARE * np.minimum(counts[1], MOST_REPEATED)
         varied = (counts[0] >= np.maximum(share, CHUNKS_PER_WINDOW)) & (chance < BY_CHANCE)

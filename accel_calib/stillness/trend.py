@@ -64,22 +64,6 @@ _CORRELATION_MAX = 0.9
 _TINY = 1e-300
 
 
-class Line(NamedTuple):
-    """
-    Least squares lines through windows, in units of one step.
-
-    `slope` is (..., n). `square` and `neighbours` are the sums of the squared residuals, and of
-    the products of neighbouring residuals. `time_square` is Σ t², `length` that of the windows.
-
-    """
-
-    slope: Floats
-    square: Floats
-    neighbours: Floats
-    time_square: float
-    length: int
-
-
 def sliding(fold: np.ufunc, values: Floats, length: int) -> Floats:
     """Return the sums (`numpy.add`) or maxima over windows of this length along the last axis."""
     count = values.shape[-1] - length + 1
@@ -105,24 +89,6 @@ def window_figures(sums: Records, origin: Floats) -> tuple[Floats, Floats]:
     mean = total / inside
     variance = np.maximum(power - total * mean, 0.0) / (inside - 1.0)
     return mean + origin[:, np.newaxis], variance
-
-
-def lines(values: Floats, length: int) -> Line:
-    """Return the lines through all windows of this length: (..., n) to (..., n - length + 1)."""
-    windows = sliding_window_view(values, length, axis=-1)
-    time = np.arange(length) - 0.5 * (length - 1)
-    time_square = float(np.sum(time**2))
-    total, moment = windows.sum(axis=-1), np.einsum('...t,t->...', windows, time)
-    slope, mean = moment / time_square, total / length
-    first, last = windows[..., 0], windows[..., -1]
-    # Relative to the mean: digits of a small noise on a large mean are lost only once.
-    square = np.einsum('...t,...t->...', windows, windows) - total * mean
-    square -= slope * moment
-    product = np.einsum('...t,...t->...', windows[..., 1:], windows[..., :-1])
-    product -= mean * (2.0 * total - first - last) - (length - 1) * mean * mean
-    product -= slope * (2.0 * moment - (time[-1] + 1.0) * (last - first))
-    product += slope * slope * float(np.sum(time[1:] * time[:-1]))
-    return Line(slope, np.maximum(square, 0.0), product, time_square, length)
 
 
 def oscillation(values: Floats, length: int, index: NDArray[np.intp]) -> Floats:
@@ -160,39 +126,53 @@ def _waves(length: int) -> tuple[Floats, Floats]:
 
 class Trend(NamedTuple):
     """
-    Slopes (3, ...) over cells, in the unit of the cells per second, and their significance.
+    Least squares lines through windows of cells of three axes.
 
-    `strength` (...) is the sum over the axes of (slope / its standard error)². `excess` is the
-    ratio of the variance of a mean to that of white noise, at least 1. `error` is the standard
-    error of the slope of the noisiest axis, for independent samples.
+    `slope` (3, ...) is in the unit of the cells per second, and `square` (3, ...) the sum of the
+    squared residuals. `strength` (...) is the sum over the axes of (slope / its standard error)².
+    `excess` is the ratio of the variance of a mean to that of white noise, at least 1. `error` is
+    the standard error of the slope of the noisiest axis, for independent samples.
 
     """
 
     slope: Floats
+    square: Floats
     strength: Floats
     excess: Floats
     error: Floats
 
 
-def strength_of(line: Line, spacing: float, white: Floats) -> Trend:
+def trend_of(values: Floats, length: int, spacing: float, white: Floats) -> Trend:
     """
-    Return the slopes of (3, ...) lines through cells at this spacing [s].
+    Return the lines through all windows of this length: (3, ..., n) to (3, ..., n - length + 1).
 
-    `white` (3, ...) is the variance of a cell mean for independent samples.
+    The cells are at this spacing [s]. `white` (3, ...) is the variance of a cell mean for
+    independent samples.
 
     """
-    size = line.length
+    windows = sliding_window_view(values, length, axis=-1)
+    time = np.arange(length) - 0.5 * (length - 1)
+    time_square = float(np.sum(time**2))
+    total, moment = windows.sum(axis=-1), np.einsum('...t,t->...', windows, time)
+    step, mean = moment / time_square, total / length
+    first, last = windows[..., 0], windows[..., -1]
+    # Relative to the mean: digits of a small noise on a large mean are lost only once.
+    square = np.einsum('...t,...t->...', windows, windows) - total * mean
+    square = np.maximum(square - step * moment, 0.0)
+    product = np.einsum('...t,...t->...', windows[..., 1:], windows[..., :-1])
+    product -= mean * (2.0 * total - first - last) - (length - 1) * mean * mean
+    product -= step * (2.0 * moment - (time[-1] + 1.0) * (last - first))
+    product += step * step * float(np.sum(time[1:] * time[:-1]))
     white = white + _TINY
-    slope, weight = line.slope / spacing, 1.0 / white
-    square = np.sum(line.square * weight, axis=0)
-    neighbours = np.sum(line.neighbours * weight, axis=0)
-    correlation = np.clip(neighbours / (square + _TINY) + 3.0 / size, 0.0, _CORRELATION_MAX)
-    power = np.maximum(square / (3.0 * max(size - 2, 1)), 1.0)
+    weight = 1.0 / white
+    squares, neighbours = (np.sum(each * weight, axis=0) for each in (square, product))
+    correlation = np.clip(neighbours / (squares + _TINY) + 3.0 / length, 0.0, _CORRELATION_MAX)
+    power = np.maximum(squares / (3.0 * max(length - 2, 1)), 1.0)
     excess = power * (1.0 + correlation) / (1.0 - correlation)
-    time_square = line.time_square * spacing**2
+    slope, time_square = step / spacing, time_square * spacing**2
     strength = np.sum(slope * slope * weight, axis=0) * time_square / excess
-    error = np.sqrt(np.max(white, axis=0) / time_square)
-    return Trend(slope, strength, excess, error)
+    return Trend(slope, square, strength, excess,
+                 np.sqrt(np.max(white, axis=0) / time_square))
 
 
 def excess_of_means(centred: Floats, white: Floats) -> float:
@@ -233,17 +213,18 @@ class Stretch:
     """
     Figures of the last chunks up to each of m chunks.
 
-    `trend` has the slopes of the reading, (3, m), and `excess` (groups, m) is that of the noise of
-    the mean, for reading and rate. `variance` (axes, m) is the mean variance of the windows, and
-    `highest` (3, m) the largest one of the reading. `samples` (m,) is their number, and `at_limit`
-    (3, m) the share that repeats the extreme of its axis so far; `same` (m,) is the share that
-    repeats the sample before. `means` (3, m + length - 1) are those of the chunks of the reading.
-    `scatter` (m,) is the mean square of their residuals, sum over the axes, and `white` (m,) the
-    same for independent samples.
+    `slope` (3, m) and `strength` (m,) are those of the reading, see `Trend`, and `excess` (groups,
+    m) that of the noise of the mean, for reading and rate. `variance` (axes, m) is the mean
+    variance of the windows, and `highest` (3, m) the largest one of the reading. `samples` (m,) is
+    their number, and `at_limit` (3, m) the share that repeats the extreme of its axis so far;
+    `same` (m,) is the share that repeats the sample before. `means` (3, m + length - 1) are those
+    of the chunks of the reading. `scatter` (m,) is the mean square of their residuals, sum over
+    the axes, and `white` (m,) the same for independent samples.
 
     """
 
-    trend: Trend
+    slope: Floats
+    strength: Floats
     excess: Floats
     variance: Floats
     highest: Floats
@@ -273,12 +254,11 @@ def stretch(sums: Records, level: Floats, length: int, size: int, spacing: float
     cells = cells.reshape(-1, 3, cells.shape[1]).swapaxes(0, 1)
     white = (variance * (length / count)).reshape(-1, 3, size).swapaxes(0, 1)
     white = white + _DIGITS * np.sum(np.square(cells[..., length - 1:]), axis=0)
-    line = lines(cells, length)
-    found = strength_of(line, spacing, white)
+    found = trend_of(cells, length, spacing, white)
     return Stretch(
-        trend=Trend(found.slope[:, 0], *(part[0] for part in found[1:])), excess=found.excess,
+        slope=found.slope[:, 0], strength=found.strength[0], excess=found.excess,
         variance=variance, highest=sliding(np.maximum, level[:3], inner), samples=count,
         at_limit=sliding(np.add, sums['at_limit'].T, length) / count,
         same=sliding(np.add, sums['repeats'], length) / np.maximum(count - length, 1.0),
-        means=cells[:, 0], scatter=np.sum(line.square, axis=(0, 1)) / length,
+        means=cells[:, 0], scatter=np.sum(found.square, axis=(0, 1)) / length,
         white=np.sum(white, axis=(0, 1)))
