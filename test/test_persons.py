@@ -327,13 +327,27 @@ def test_an_offered_calibration_waits_for_save_and_is_reported_as_not_in_use() -
     assert figures(driver)['in_use'] is True
 
 
-@pytest.mark.parametrize('command', ['set_level', 'calibrate_at_rest'])
-def test_a_mounting_alone_is_reported(command: str) -> None:
+@pytest.mark.parametrize(('command', 'words'), [
+    ('set_level', 'correcting the mounting alone, offset and gain are not calibrated'),
+    ('calibrate_at_rest', 'correcting, with a calibration of a part of the orientations')])
+def test_a_mounting_alone_is_reported(command: str, words: str) -> None:
     driver = Driver(auto_capture=False)
     Person(driver, healthy).rest([0.1, 0.0, 1.0], 4.0)
     driver.ask(command)
     assert figures(driver)['rotation'][2] != [0.0, 0.0, 1.0]
+    assert dict(health_figures(driver.session.state))['state'] == words
     assert not driver.logged('error')
+
+
+def test_an_offer_that_is_discarded_names_what_is_in_use() -> None:
+    driver = Driver(auto_capture=False, confirm=True)
+    Person(driver, healthy).rest([0.0, 0.0, 1.0], 4.0)
+    for saves, words in ((False, 'there is no other one'), (True, 'the one in use is unchanged')):
+        driver.ask('calibrate_at_rest')
+        if saves:
+            driver.ask('save')
+            driver.ask('set_level')
+        assert driver.ask('undo').endswith(words)
 
 
 def test_slow_motion_by_hand_is_named_while_a_pose_is_waited_for() -> None:

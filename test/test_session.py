@@ -13,7 +13,8 @@ from accel_calib.effects import Covariate
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.finding import Finding, has, LEVELS
 from accel_calib.logs import open_log, read_poses, write_table
-from accel_calib.session import CalibratorSettings, changed, next_step, progress, Surroundings
+from accel_calib.session import (
+    CalibratorSettings, changed, enable, next_step, progress, Surroundings)
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Poses
 from driven import Driver, RATE
@@ -76,6 +77,8 @@ def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
     assert second.finding('calibration').level == 'BAD'
     assert words in second.finding('calibration').words
     second.refuses(words, 'fit', 'save', 'load')
+    for on in (False, True):
+        assert enable(second.session, on).endswith('files, nothing is published')
     assert path.read_bytes() == before
     assert len(read_poses(path.with_name('known_poses.csv'))) == 12
     first.session.close()

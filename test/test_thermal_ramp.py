@@ -21,10 +21,12 @@ import accel_calib as ac
 from accel_calib.calibration import Curve, curve_of
 from accel_calib.effects import OFFSET_POWERS
 from accel_calib.logs import write_table
+from accel_calib.session import figures
 from accel_calib.stillness import cells_of, Ramp, ramp_of
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Recording
 from accel_calib.units import MG
+from driven import Driver
 from faults.sample import sample
 from inside import Intake, RampIntake, thermally_calibrated
 import numpy as np
@@ -274,3 +276,9 @@ def test_ramps_of_several_orientations_share_one_curve():
 def test_a_log_in_which_the_board_moved_is_refused(tmp_path, capsys):
     path = data('sensehat_lsm9ds1_temperature.csv')
     assert 'the board moved' in refused(capsys, 'thermal', path, '-o', tmp_path / 'd.yaml')
+
+
+def test_a_session_with_the_offset_over_temperature_alone_says_so(tmp_path: Path) -> None:
+    write_calibration(tmp_path / 'c.yaml', thermal(ramp(3)).calibration)
+    state = Driver(calibration_file=str(tmp_path / 'c.yaml')).session.state
+    assert dict(figures(state))['state'] == 'correcting the offset over temperature alone'

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from . import use
-from .conditions import next_words, thermometer_words
+from .conditions import next_words, thermometer_words, words_of_state
 from .state import Sensor, State
 from .store import writing_advice
 from .use import adopt, Fitted, Holder, rate, show_poses
@@ -328,7 +328,9 @@ def undo(session: Holder) -> Task:
         session.change(sensor=session.sensor.offer(None))
         session.change_sensor(fitted_poses=0)
         rate(session, None)
-        return 'the calibration on ~/preview is discarded; the one in use is unchanged'
+        kept = 'there is no other one' if session.sensor.calibration is None else (
+            'the one in use is unchanged')
+        return f'the calibration on ~/preview is discarded; {kept}'
     calibration = yield from _alone(session, Files(session.state.files.usable().step_back))
     before = session.sensor.calibration
     adopt(session, calibration)
@@ -371,6 +373,8 @@ COMMANDS: dict[str, Callable[[Holder], Any]] = {each.__name__: each for each in 
 def enable(session: Holder, on: bool) -> str:
     """Switch the correction on or off."""
     session.change(enabled=on)
+    if session.state.files.problem:
+        return f'the correction is {"on" if on else "off"}, but {words_of_state(session.state)}'
     if not on:
         return 'the correction is off: raw messages are published unchanged'
     if session.sensor.calibration is None:
