@@ -330,7 +330,36 @@ have quantities, either."""
 
 
 class Expected:
-    """The expected error of a calibration in new orientations, and its parts."""
+    """
+    The expected error of a calibration in new orientations, and its parts.
+
+    Attributes
+    ----------
+    poses, directions, noise : Poses, (n, 3) and (n,) array
+        The poses used, up in each, unit vectors in the sensor axes, and its noise.
+    outliers : tuple of int
+        Rows that were left out as outliers.
+    is_partial : bool
+        Whether the sensor could not be turned over.
+    omits : str
+        Name of the smaller model if values that every sensor has are omitted.
+    dof : int
+        Number of equations of distinct poses beyond the number of free values. The errors of poses
+        with known forces are vectors.
+    noise_mg : float or None
+        Noise of a pose, RMS over the poses; None if it is not known.
+    stated_mg, worst_mg : float
+        Stated uncertainty, RMS over the sphere (partial: over the poses), and the largest one.
+    hidden_mg : float
+        Residual beyond the noise; without known noise, the residual.
+    is_beyond_noise : bool
+        Whether the poses show what the model does not contain.
+    inexact_mg, error_mg : float
+        Part of the expected error that more poses reduce, and the whole, as a bound.
+    own_mg : float
+        Expected error by what the poses show, without omitted values.
+
+    """
 
     def __init__(self, calibration: Calibration) -> None:
         quality, effects = calibration.quality, calibration.model.effects
@@ -338,57 +367,40 @@ class Expected:
         self.poses = calibration.used_poses
         self.directions = directions_in(self.poses, calibration)
         self.noise = pose_noise(self.poses.noise, self.directions)
-        # The rows that were left out as outliers.
         self.outliers = tuple(each.row for each in calibration.rejected if each.kind == 'outlier')
-        # Whether the sensor could not be turned over.
         self.is_partial = calibration.method == PRIOR
-        # The name of the smaller model if values that every sensor has are omitted.
         known = {*effects} & {*LADDER}
         self.omits = next((name for name in ('4', '7') if {*MODELS[name].effects} == known), '')
-        # The number of equations of distinct poses beyond the number of free values. The errors
-        # of poses with known forces are vectors.
         rows = 3 if calibration.form.known_orientation and 'reference' in self.poses else 1
         free = (free_parameters(calibration.name) if calibration.form.sensing_axes
                 else int(np.count_nonzero(np.diag(calibration.covariance))))
-        dof = max(len(np.unique(self.poses.reading, axis=0)) * rows - free, 0)
-        self.dof = dof
-        # The ratio of an error to its residual after a fit.
-        per_dof = math.sqrt(len(self.poses) * rows / dof) if dof else 1.0
-        # The noise of a pose [mg], RMS over the poses; None if it is not known.
+        self.dof = dof = max(len(np.unique(self.poses.reading, axis=0)) * rows - free, 0)
+        per_dof = math.sqrt(len(self.poses) * rows / dof) if dof else 1.0  # error over residual
         floor, chi2 = quality.noise_floor_mg, quality.chi2_per_dof
         self.noise_mg = None if floor is None else floor * per_dof
-        # The error without the calibration, without noise [mg]; None if it is not known.
-        self.before_mg = None if calibration.units.is_native else without_noise(
-            quality.rms_before_mg, self.noise_mg)
-        # The stated uncertainty, RMS over the sphere [mg]; partial: over the poses.
         self.stated_mg = MG * (
             rms(deviations_g(calibration, self.directions)) if self.is_partial and effects else
             stated_uncertainty(calibration) or 0.0)
-        # The largest stated uncertainty over the sphere [mg].
         self.worst_mg = uncertainty_g(calibration) * MG if effects else 0.0
         # The factor on the uncertainty because few poses check the noise, and the ratio of the
         # largest scatter that their squares allow to its RMS.
-        self.few = scatter = 1.0
+        few = scatter = 1.0
         if dof:
             scatter = math.sqrt(dof / float(scipy.special.chdtri(dof, 1.0 - _UNLUCKY)))
         if dof and chi2 is not None:
-            self.few = max(math.sqrt(chi2 / variance_factor(chi2 * dof, dof, True)) * scatter, 1.0)
-        # The residual beyond the noise [mg]; without known noise, the residual.
+            few = max(math.sqrt(chi2 / variance_factor(chi2 * dof, dof, True)) * scatter, 1.0)
         self.hidden_mg = 0.0
         if dof and not self.is_partial:
             if floor is None or chi2 is None:
                 self.hidden_mg = quality.rms_after_mg * per_dof
             elif scipy.special.chdtrc(dof, chi2 * dof) <= _LEVEL:
                 self.hidden_mg = without_noise(quality.rms_after_mg, floor) * per_dof
-        # Whether the poses show what the model does not contain.
         self.is_beyond_noise = self.noise_mg is not None and self.hidden_mg >= max(
             MATTERS.value, self.noise_mg * math.sqrt(HIDDEN.value ** 2 - 1.0))
-        # The part of the expected error that more poses reduce, and the whole, as a bound [mg].
-        self.inexact_mg = math.hypot(BOUND * self.stated_mg * self.few, self.omitted_mg)
+        self.inexact_mg = math.hypot(BOUND * self.stated_mg * few, self.omitted_mg)
         self.error_mg = math.hypot(
             self.inexact_mg, self.hidden_mg * (1.0 if self.noise_mg is None else scatter),
             *(size for _, size in self.not_corrected))
-        # The expected error by what the poses show, without omitted values [mg].
         self.own_mg = math.hypot(self.stated_mg, self.hidden_mg)
 
     @cached_property

@@ -379,8 +379,10 @@ def enable(session: Holder, on: bool) -> str:
         return 'the correction is off: raw messages are published unchanged'
     if session.sensor.calibration is None:
         published = 'raw messages are' if session.state.settings.passthrough else 'nothing is'
-        return (f'the correction is on, but there is no calibration yet: {published} '
-                'published; capture poses and call ~/fit')
+        step = 'capture poses and call ~/fit' if session.sensor.offered is None else (
+            'call ~/save to use the one that waits')
+        return (f'the correction is on, but there is no calibration yet: {published} published; '
+                f'{step}')
     return 'the correction is on: corrected messages are published'
 
 
