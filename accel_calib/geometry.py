@@ -15,11 +15,10 @@ from itertools import permutations, product
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .errors import InputError
 from .statistics import rms
-from .table import Floats
+from .units import Floats, Indices
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
@@ -146,7 +145,7 @@ def coverage(directions: Floats) -> float:
     return 1.0 - len(uncovered(directions)) / _COVERAGE_DIRECTIONS
 
 
-def orientations_of(directions: Floats) -> NDArray[np.intp]:
+def orientations_of(directions: Floats) -> Indices:
     """Return the (n,) number of the orientation of (n, 3) unit vectors; others are 5° apart."""
     first, found = np.zeros_like(directions), np.zeros(len(directions), np.intp)
     count = 0

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.intp]
+Bools = NDArray[np.bool_]
 
 UnitName = Literal['m/s2', 'g', 'native']
 UNIT_NAMES: tuple[str, ...] = get_args(UnitName)

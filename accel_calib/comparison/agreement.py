@@ -57,9 +57,8 @@ from ..calibration import Calibration, fit_unknown, in_g, NORM_MODELS
 from ..effects import add_history, Context, Model, predict
 from ..errors import InputError, RefusedFitError
 from ..estimate import judge, scatter_of
-from ..table import Floats
 from ..text import counted
-from ..units import STANDARD_GRAVITY
+from ..units import Floats, STANDARD_GRAVITY
 
 NAMES = ('offset.x', 'offset.y', 'offset.z', 'gain.x', 'gain.y', 'gain.z', 'gain.xy', 'gain.xz',
          'gain.yz')

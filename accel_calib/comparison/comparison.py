@@ -25,9 +25,8 @@ from ..effects import Context, length_rows, sensor_force
 from ..errors import InputError
 from ..geometry import OVER_THE_SPHERE
 from ..statistics import rms
-from ..table import Floats
 from ..text import counted, listed
-from ..units import MG
+from ..units import Floats, MG
 
 _COMMON = ('temperature', 'supply_voltage')
 """Context that is set to the same value for all runs; other context is specific to a run."""

@@ -39,8 +39,7 @@ from ..findings import mounting_words, Rating
 from ..messages import Known, OneReading, output_scale, Triple
 from ..refinement import Refinement
 from ..stillness import Dwell, overlap, rest_after
-from ..table import Floats
-from ..units import FrameName, Units
+from ..units import Floats, FrameName, Units
 
 _SHORT_REST = 30.0
 """Shortest remainder of a partly counted rest that counts [s]."""

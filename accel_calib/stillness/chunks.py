@@ -29,8 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..table import Floats
-from ..units import Units
+from ..units import Floats, Indices, Units
 
 Repeated = Literal['keep', 'merge', 'refuse']
 REPEATED: tuple[str, ...] = get_args(Repeated)
@@ -120,8 +119,6 @@ def settings_from(given: Mapping[str, Any], units: Units) -> CaptureSettings:
     except ValueError as err:
         raise InputError(str(err), 'change that setting') from err
 
-
-Indices = NDArray[np.intp]
 
 Records = NDArray[Any]
 """One-dimensional structured array."""

@@ -31,7 +31,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .detector import check_finite
 from ..effects import rate_at
@@ -39,7 +38,7 @@ from ..errors import InputError
 from ..geometry import unit
 from ..table import Floats, in_unit, numbered, Poses, range_of, Recording
 from ..text import counted
-from ..units import MG, Units
+from ..units import Bools, MG, Units
 
 LEAST_RANGE = 3.0
 """Smallest range of the temperature of a ramp [°C]; the autopilots ask for 10 °C or more."""
@@ -129,7 +128,7 @@ def _check_scale(units: Units) -> None:
                          'convert the readings')
 
 
-def _is_still(cells: Poses) -> NDArray[np.bool_]:
+def _is_still(cells: Poses) -> Bools:
     """Return in which cells the board does not shake."""
     size = np.max(cells['std'], axis=1) if 'std' in cells else np.zeros(len(cells))
     return np.asarray(size <= max(_SHAKEN * float(np.median(size)), _SHAKEN_G))

@@ -54,13 +54,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records
 from .trend import oscillation, sliding, Stretch, stretch, window_figures
 from ..statistics import rms
-from ..table import Floats
-from ..units import Units
+from ..units import Bools, Floats, Indices, Units
 
 LONG = 12
 """Number of chunks from which the noise is estimated."""
@@ -338,7 +336,7 @@ class Rule:
         return _half_range(low, high, noise)
 
     def is_steep(self, slope: Floats, scale: Floats, variance: Floats, drift_g: float = SLOPE_G
-                 ) -> NDArray[np.bool_]:
+                 ) -> Bools:
         """
         Return whether (3, ...) slopes [per s] are larger than a drift of `drift_g` [g/s].
 
@@ -350,7 +348,7 @@ class Rule:
             drift = np.maximum(drift, SLOPE_NOISE * np.sqrt(variance.mean(axis=0)))
         return np.asarray(np.sum(slope**2, axis=0) > drift**2)
 
-    def reads_gravity(self, means: Floats) -> NDArray[np.bool_]:
+    def reads_gravity(self, means: Floats) -> Bools:
         """
         Return whether the (n, 3) means of rests are of 1 g within the tolerance.
 
@@ -383,7 +381,7 @@ class Rule:
         return np.asarray((length > PLAUSIBLE_G[0]) & (length < PLAUSIBLE_G[1]))
 
     def _trending(self, seen: Mapping[int, Stretch], mean: Floats, limit: Floats, scale: Floats
-                  ) -> NDArray[np.intp]:
+                  ) -> Indices:
         trending = np.zeros(mean.shape[1], dtype=np.intp)
         one_g = scale
         if not self.known:  # the scale is too small before several orientations are seen
@@ -400,9 +398,9 @@ class Rule:
             trending[calm & moved] = length
         return trending
 
-    def _learn(self, seen: Stretch, mean: Floats, step: Floats, zero: NDArray[np.bool_],
-               repeated: NDArray[np.bool_], off: NDArray[np.bool_]
-               ) -> tuple[Floats, NDArray[np.bool_]]:
+    def _learn(self, seen: Stretch, mean: Floats, step: Floats, zero: Bools,
+               repeated: Bools, off: Bools
+               ) -> tuple[Floats, Bools]:
         """
         Return the variance of the noise at each chunk, and whether rests vary beyond rounding.
 

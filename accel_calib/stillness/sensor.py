@@ -23,9 +23,8 @@ import numpy as np
 from ..effects import AXES
 from ..errors import RefusedFitError
 from ..geometry import sphere_through, unit
-from ..table import Floats
 from ..text import short
-from ..units import Units
+from ..units import Floats, Units
 
 _ONE_DIRECTION = math.cos(math.radians(6.0))
 """Cosine of the largest angle between readings of a board that was not turned."""

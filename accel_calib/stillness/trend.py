@@ -49,10 +49,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
 from .chunks import CHUNKS_PER_WINDOW, Records
-from ..table import Floats
+from ..units import Floats, Indices
 
 _FEWEST_PERIODS = 2.0
 """Number of periods in a window below which a drift resembles an oscillation."""
@@ -91,7 +90,7 @@ def window_figures(sums: Records, origin: Floats) -> tuple[Floats, Floats]:
     return mean + origin[:, np.newaxis], variance
 
 
-def oscillation(values: Floats, length: int, index: NDArray[np.intp]) -> Floats:
+def oscillation(values: Floats, length: int, index: Indices) -> Floats:
     """
     Return the (m,) largest shares of the residuals of all axes that one frequency explains.
 
