@@ -36,8 +36,6 @@ values of the models are uncertain in them, too, so it is what `refine` will rep
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace

@@ -11,8 +11,6 @@ it only offers it: it is published on ~/preview, until ~/save stores it or ~/und
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Generator
 from dataclasses import replace
 from functools import partial

@@ -12,8 +12,6 @@ Types are checked here and not by rclpy. rclpy refuses ``5`` for ``5.0`` and ``m
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, Field, field, fields, replace

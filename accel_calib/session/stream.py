@@ -9,8 +9,6 @@ is played at another speed. They cover the last `_SPAN` seconds.
 
 """
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy
