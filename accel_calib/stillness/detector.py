@@ -289,7 +289,7 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
 def samples_of(recording: Recording, start: int, stop: int, context: Sequence[str] = CONTEXT
                ) -> Floats:
     """
-    Return samples start to stop for `StillDetector.add`: (k, n), a row for each of its columns.
+    Return samples start to stop as (k, n), one row per column of `StillDetector.push`.
 
     InputError if a time or a reading is not finite.
 
