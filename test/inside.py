@@ -55,7 +55,6 @@ from accel_calib.geometry import (
     unit, words_of)
 from accel_calib.logs import (
     bag_samples, child, is_port, layout_with, LogOptions, open_bag, open_log, port, text)
-from accel_calib.logs.bag import frame_ids, stamps_of
 from accel_calib.logs.names import meaning
 from accel_calib.logs.port import _interval as interval_of_lines
 from accel_calib.logs.quantities import are_samples
