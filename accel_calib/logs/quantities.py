@@ -143,9 +143,7 @@ class Quantities:
     def columns(self, cells: Cells, source: str, *, partial: bool = False
                 ) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:
         """Return the columns of a block in our units, and its row numbers; see `check_values`."""
-        if self.instance is not None:
-            cells = cells.take(self.chosen.numbers(cells, 'instance')[:, 0] == self.instance)
-        columns: dict[str, NDArray[Any]] = {}
+        cells, columns = self.of_instance(cells), dict[str, NDArray[Any]]()
         for key, own in self.chosen.sources.items():
             if key == 'label':
                 columns[key] = np.array([*map(one_line, cells.texts[own[0]])], str)
@@ -162,6 +160,12 @@ class Quantities:
             columns['time'] = (cells.row - 1) / self.rate_hz
         check_values(columns, source, partial=partial)
         return columns, cells.row
+
+    def of_instance(self, cells: Cells) -> Cells:
+        """Return the rows of the sensor that is read."""
+        if self.instance is None:
+            return cells
+        return cells.take(self.chosen.numbers(cells, 'instance')[:, 0] == self.instance)
 
     def numbers(self, cells: Cells, key: str) -> Floats:
         """Return the numbers of a key, (n, k), with their sign, in the unit of the file."""
@@ -180,16 +184,8 @@ def decide_quantities(columns: Chosen, first: Cells, options: LogOptions) -> Qua
         made.notes += [columns.maker.note] if columns.maker.note else []
     made.said += columns.layout.words
     if 'instance' in columns.sources:
-        there = np.unique(columns.numbers(first, 'instance')).tolist()
-        names = [f'{each:g}' for each in there]
-        if options.sensor and options.instance not in names:
-            raise InputError(f'{columns.layout.path} has the sensors {", ".join(names)}, expected '
-                             f'{options.sensor}', 'choose one of them with --sensor')
-        made.instance = float(options.instance) if options.sensor else there[0]
-        if len(there) > 1 and not options.sensor:
-            made.notes.append(f'the log has the sensors {", ".join(names)}; sensor {names[0]} is '
-                              'read: choose another with --sensor')
-        first = first.take(columns.numbers(first, 'instance')[:, 0] == made.instance)
+        _choose_instance(made, columns.numbers(first, 'instance')[:, 0], options)
+        first = made.of_instance(first)
     for key in ('reading', 'rate'):
         if key in columns.sources and (modulus := modulus_of(columns.numbers(first, key))):
             made.modulus[key] = modulus
@@ -216,6 +212,19 @@ def decide_quantities(columns: Chosen, first: Cells, options: LogOptions) -> Qua
     _decide_context(made, first)
     made.findings += made.clock.findings
     return made
+
+
+def _choose_instance(made: Quantities, numbers: Floats, options: LogOptions) -> None:
+    """Choose one of the sensors whose rows alternate, by their numbers; by default the lowest."""
+    there = np.unique(numbers).tolist()
+    names = [f'{each:g}' for each in there]
+    if options.sensor and options.instance not in names:
+        raise InputError(f'{made.chosen.layout.path} has the sensors {", ".join(names)}, expected '
+                         f'{options.sensor}', 'choose one of them with --sensor')
+    made.instance = float(options.instance) if options.sensor else there[0]
+    if len(there) > 1 and not options.sensor:
+        made.notes.append(f'the log has the sensors {", ".join(names)}; sensor {names[0]} is '
+                          'read: choose another with --sensor')
 
 
 def _find_gyro(made: Quantities, first: Cells) -> None:
