@@ -255,8 +255,8 @@ class Chosen:
 
     All are indices of columns. `sources` are those of a key of `COLUMNS`; those of ``KEY/`` divide
     the ones of a key, and ``instance`` is the number of the sensor. The others are the columns of
-    numbers that each row needs, those of the `context` that poses may lack, the `labels`, `dates`
-    (times as text), and further columns of numbers, the `quantities`.
+    numbers that each row needs, those of the `context` that poses may lack, `dates` (times as
+    text), and further columns of numbers, the `quantities`.
 
     """
 
@@ -265,7 +265,6 @@ class Chosen:
     maker: LogFormat | None
     needed: tuple[int, ...]
     context: tuple[int, ...]
-    labels: tuple[int, ...]
     dates: tuple[int, ...]
     quantities: Mapping[str, int]
 
@@ -341,8 +340,7 @@ def choose_columns(layout: TextLayout, options: LogOptions) -> Chosen:
             quantities.setdefault(quantity_key(name), k)
     return Chosen(
         layout=layout, sources=sources, maker=maker, needed=tuple(sorted(needed - context)),
-        context=tuple(sorted(context)), labels=sources.get('label', ()), dates=dates,
-        quantities=quantities)
+        context=tuple(sorted(context)), dates=dates, quantities=quantities)
 
 
 def _name_columns(layout: TextLayout, options: LogOptions

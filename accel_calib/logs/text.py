@@ -382,7 +382,7 @@ class TextTable:
         self._line += len(lines)
         numbers = dict(zip(numeric, values.reshape(-1, len(numeric)).T, strict=True))
         texts = {k: np.array([dialect.cells(line)[k] for line in rows], object)
-                 for k in (*self.columns.labels, *self.columns.dates)}
+                 for k in (*self.columns.sources.get('label', ()), *self.columns.dates)}
         return Cells(numbers, texts, number)
 
     def _parsed(self, lines: list[str]) -> Floats | None:
