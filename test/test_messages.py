@@ -20,12 +20,11 @@ from accel_calib.effects import EFFECTS
 from accel_calib.errors import AccelCalibError, InputError
 from accel_calib.logs import (
     ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
-    doubles_at, IMU_DOUBLES, joined, layout_of, LITTLE_ENDIAN, ORIENTATION, ORIENTATION_COVARIANCE,
-    rewritten, samples_of)
+    IMU_DOUBLES, joined, layout_of, LITTLE_ENDIAN, ORIENTATION, ORIENTATION_COVARIANCE)
 from accel_calib.messages import corrected, OneReading, output_frame, Rewriter
 from accel_calib.units import STANDARD_GRAVITY
 from bag_files import swapped
-from inside import frame_ids, Model, rotation_from_rpy, stamps_of
+from inside import Model, rotation_from_rpy
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -134,11 +133,11 @@ def test_messages_get_other_numbers_and_another_frame_id(ros2, name):
     else:  # the serialization of ROS 1: four bytes of seq, no NUL, no padding
         raws = [raw[:12] + struct.pack('<I', 8) + b'imu_link' + raw[-296:] for raw in raws]
     before = joined(raws, 37, 'imu', ros2=ros2)
-    found = joined(list(rewritten(before, fields_of(4)[::-1], name)), 37, 'imu', ros2=ros2)
-    assert frame_ids(found) == ['imu_link' if name is None else name]
-    np.testing.assert_array_equal(stamps_of(found), stamps_of(before))
+    found = joined(list(before.rewrite(fields_of(4)[::-1], name)), 37, 'imu', ros2=ros2)
+    assert found.frame_ids == ['imu_link' if name is None else name]
+    np.testing.assert_array_equal(found.stamps, before.stamps)
     np.testing.assert_array_equal(found.swapped, before.swapped)
-    np.testing.assert_array_equal(doubles_at(found, slice(0, 37)), fields_of(4)[::-1])
+    np.testing.assert_array_equal(found.doubles(slice(0, 37)), fields_of(4)[::-1])
 
 
 def test_single_messages_and_arrays_have_the_same_lag(calibration):
@@ -146,8 +145,8 @@ def test_single_messages_and_arrays_have_the_same_lag(calibration):
     datas = [message(fields, stamp=(100 + k // 10, k % 10 * 100_000_000)) for k in range(400)]
     rewriter, together = rewriter_of(datas[0], calibration), joined(datas, 37, 'imu')
     temperature = 25.0 + 3.0 * np.sin(np.arange(400) / 90.0)
-    expected = corrected(calibration, doubles_at(together, slice(0, 37)),
-                         {**samples_of(together), 'temperature': temperature})
+    expected = corrected(calibration, together.doubles(slice(0, 37)),
+                         {**together.columns, 'temperature': temperature})
     found = [doubles_of(rewriter(data, {'temperature': warm}))
              for data, warm in zip(datas, temperature.tolist(), strict=True)]
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)

@@ -13,9 +13,8 @@ process with limits. `bag` defines the places of the fields in serialized messag
 from .autopilot import ARDUPILOT_REFERENCE, ByAxis, DEGREE, PER_MILLION
 from .bag import (
     ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
-    doubles_at, IMU_DOUBLES, imus_of, joined, Layout, layout_of, layout_with, LITTLE_ENDIAN,
-    NAME_AT, NINE, open_bag, ORIENTATION, ORIENTATION_COVARIANCE, rewritten, samples_of, STAMP,
-    STAMP_AT, THREE)
+    IMU_DOUBLES, imus_of, joined, Layout, layout_of, layout_with, LITTLE_ENDIAN, NAME_AT, NINE,
+    open_bag, ORIENTATION, ORIENTATION_COVARIANCE, STAMP, STAMP_AT, THREE)
 from .bag_samples import field_of, messages_of, named_topics, topic_and_field
 from .child import parts_of
 from .columns import LogOptions
@@ -23,7 +22,6 @@ from .containers import Frame, Piped
 from .formats import (
     BAG, FORMATS, is_bag, open_log, OpenLog, Progress, read_poses, read_recording, SUFFIXES)
 from .names import NAMES
-from .port import is_port, open_port
 from .quantities import are_samples
 from .text import LineReader, write_blocks, write_table
 
@@ -32,7 +30,6 @@ __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
            'IMU_DOUBLES', 'LITTLE_ENDIAN', 'NAMES', 'NAME_AT', 'NINE', 'ORIENTATION',
            'ORIENTATION_COVARIANCE', 'PER_MILLION', 'STAMP', 'STAMP_AT', 'SUFFIXES', 'THREE',
            'ByAxis', 'Frame', 'Layout', 'LineReader', 'LogOptions', 'OpenLog', 'Piped', 'Progress',
-           'are_samples', 'doubles_at', 'field_of', 'imus_of', 'is_bag', 'is_port', 'joined',
-           'layout_of', 'layout_with', 'messages_of', 'named_topics', 'open_bag', 'open_log',
-           'open_port', 'parts_of', 'read_poses', 'read_recording', 'rewritten', 'samples_of',
-           'topic_and_field', 'write_blocks', 'write_table']
+           'are_samples', 'field_of', 'imus_of', 'is_bag', 'joined', 'layout_of', 'layout_with',
+           'messages_of', 'named_topics', 'open_bag', 'open_log', 'parts_of', 'read_poses',
+           'read_recording', 'topic_and_field', 'write_blocks', 'write_table']

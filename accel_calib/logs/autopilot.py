@@ -414,10 +414,10 @@ def at(time: Floats, key: str, sources: Iterable[tuple[Message, NDArray[Any]]]
     return {}
 
 
-def sound(message: Message, columns: Mapping[str, Floats], why: str,
-          valid: NDArray[np.bool_] | bool = True) -> tuple[dict[str, Floats], list[str]]:
-    """Return the valid rows whose values are all finite, and a note on the others."""
-    kept = valid & np.all(np.isfinite(np.column_stack([*columns.values()])), axis=1)
+def sound(message: Message, columns: Mapping[str, Floats], why: str
+          ) -> tuple[dict[str, Floats], list[str]]:
+    """Return the rows whose values are all finite, and a note on the others."""
+    kept = np.all(np.isfinite(np.column_stack([*columns.values()])), axis=1)
     dropped = int(np.sum(~kept))
     notes = [f'{counted(dropped, "row")} of {message} left out: {why}'] if dropped else []
     return {key: values[kept] for key, values in columns.items()}, notes

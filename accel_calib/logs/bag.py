@@ -146,6 +146,62 @@ class Messages:
     def __len__(self) -> int:
         return len(self.start)
 
+    @property
+    def stamps(self) -> Floats:
+        """Return the header stamps [s]."""
+        seconds = self.head[:, 1]
+        signed = seconds.view(np.int32) if self.ros2 else seconds
+        return signed + self.head[:, 2] * NANO
+
+    @property
+    def frame_ids(self) -> list[str]:
+        """Return the frame_id of each message; only one item if all are equal."""
+        length, first = self.head[:, 3].astype(np.int64), self.start + LETTERS_AT
+        if np.all(length == length[0]):
+            names = sliding_window_view(self.data, int(length[0]))[first]
+            if np.all(names == names[0]):
+                length, first = length[:1], first[:1]
+        return [self.data[place:place + size].tobytes().rstrip(b'\0').decode(errors='replace')
+                for place, size in zip(first.tolist(), length.tolist(), strict=True)]
+
+    @property
+    def columns(self) -> dict[str, Floats]:
+        """
+        Return Imu messages as columns of `accel_calib.table`.
+
+        They are ``time`` (n,) [s], ``reading`` (n, 3) and ``rate`` (n, 3) [rad/s], which is NaN
+        for a message without a rate.
+
+        """
+        rate, first = self.doubles(ANGULAR_VELOCITY), ANGULAR_VELOCITY_COVARIANCE.start
+        absent = self.doubles(slice(first, first + 1))[:, 0] == -1.0
+        rate[absent | ~np.isfinite(rate).all(axis=1)] = np.nan
+        return {'time': self.stamps, 'reading': self.doubles(ACCELERATION), 'rate': rate}
+
+    def doubles(self, which: slice) -> Floats:
+        """Return a slice of the doubles of each message, (n, k)."""
+        begin, width = self.begin + 8 * which.start, 8 * (which.stop - which.start)
+        values = sliding_window_view(self.data, width)[begin].view('<f8')
+        if np.any(self.swapped):
+            values[self.swapped] = values[self.swapped].byteswap()
+        return values
+
+    def rewrite(self, values: Floats, frame_id: str | None) -> Iterator[bytes]:
+        """Yield messages with all (n, k) doubles replaced, and their frame_id, if not None."""
+        stored, data = values.astype('<f8'), self.data.data
+        stored[self.swapped] = stored[self.swapped].byteswap()
+        letters = (frame_id or '').encode() + (b'\0' if self.ros2 else b'')
+        size = begin_of(len(letters), ros2=self.ros2)
+        for doubles, start, begin, stop, swapped in zip(stored, *(each.tolist() for each in (
+                self.start, self.begin, self.stop, self.swapped)), strict=True):
+            body = doubles.tobytes()
+            if frame_id is None:
+                yield bytes(data[start:begin]) + body + data[begin + len(body):stop]
+            else:
+                length = len(letters).to_bytes(4, 'big' if swapped else 'little')
+                head = bytes(data[start:start + NAME_AT]) + length + letters
+                yield head.ljust(size, b'\0') + body
+
 
 def joined(raws: Sequence[bytes | memoryview], doubles: int, name: str, *, ros2: bool = True,
            before: int = 0) -> Messages:
@@ -186,67 +242,6 @@ def _check(sound: NDArray[np.bool_], size: Indices, name: str, before: int) -> N
         raise InputError(f'{name}: message {before + first + 1} of {size[first]} bytes is '
                          'damaged, expected a whole message',
                          'remove it from the bag, or record again')
-
-
-def stamps_of(messages: Messages) -> Floats:
-    """Return the header stamps [s]."""
-    seconds = messages.head[:, 1]
-    signed = seconds.view(np.int32) if messages.ros2 else seconds
-    return signed + messages.head[:, 2] * NANO
-
-
-def frame_ids(messages: Messages) -> list[str]:
-    """Return the frame_id of each message; only one item if all are equal."""
-    length, first = messages.head[:, 3].astype(np.int64), messages.start + LETTERS_AT
-    if np.all(length == length[0]):
-        names = sliding_window_view(messages.data, int(length[0]))[first]
-        if np.all(names == names[0]):
-            length, first = length[:1], first[:1]
-    return [messages.data[place:place + size].tobytes().rstrip(b'\0').decode(errors='replace')
-            for place, size in zip(first.tolist(), length.tolist(), strict=True)]
-
-
-def doubles_at(messages: Messages, which: slice) -> Floats:
-    """Return a slice of the doubles of each message, (n, k)."""
-    width = 8 * (which.stop - which.start)
-    begin = messages.begin + 8 * which.start
-    values = sliding_window_view(messages.data, width)[begin].view('<f8')
-    if np.any(messages.swapped):
-        values[messages.swapped] = values[messages.swapped].byteswap()
-    return values
-
-
-def rewritten(messages: Messages, values: Floats, frame_id: str | None) -> Iterator[bytes]:
-    """Yield messages with all their (n, k) doubles replaced, and their frame_id, if not None."""
-    stored, data = values.astype('<f8'), messages.data.data
-    stored[messages.swapped] = stored[messages.swapped].byteswap()
-    letters = (frame_id or '').encode() + (b'\0' if messages.ros2 else b'')
-    size = begin_of(len(letters), ros2=messages.ros2)
-    for doubles, start, begin, stop, swapped in zip(stored, *(each.tolist() for each in (
-            messages.start, messages.begin, messages.stop, messages.swapped)), strict=True):
-        body = doubles.tobytes()
-        if frame_id is None:
-            yield bytes(data[start:begin]) + body + data[begin + len(body):stop]
-        else:
-            length = len(letters).to_bytes(4, 'big' if swapped else 'little')
-            head = bytes(data[start:start + NAME_AT]) + length + letters
-            yield head.ljust(size, b'\0') + body
-
-
-def samples_of(messages: Messages) -> dict[str, Floats]:
-    """
-    Return Imu messages as columns of `accel_calib.table`.
-
-    They are ``time`` (n,) [s], ``reading`` (n, 3) and ``rate`` (n, 3) [rad/s], which is NaN for a
-    message without a rate.
-
-    """
-    rate = doubles_at(messages, ANGULAR_VELOCITY)
-    first = ANGULAR_VELOCITY_COVARIANCE.start
-    absent = doubles_at(messages, slice(first, first + 1))[:, 0] == -1.0
-    rate[absent | ~np.isfinite(rate).all(axis=1)] = np.nan
-    return {'time': stamps_of(messages), 'reading': doubles_at(messages, ACCELERATION),
-            'rate': rate}
 
 
 # ------------------------------------------------------------------------------- an open bag
@@ -338,7 +333,7 @@ class Bag:
         if not block and msgtype == IMU:
             raise InputError(f'{self.path} has no message on {topic}, expected Imu messages',
                              'record while the sensor publishes')
-        return frame_ids(self.joined(block, topic, msgtype))[0] if block else ''
+        return self.joined(block, topic, msgtype).frame_ids[0] if block else ''
 
     def numbers(self, connection: Connection) -> tuple[str, ...]:
         """Return the paths of the single numbers of a message, without headers and times."""
@@ -389,7 +384,7 @@ def imus_of(messages: Messages, name: str, before: int, sensor: str, *, chosen: 
     acceleration that is not finite, and a number beyond any sensor.
 
     """
-    names = frame_ids(messages)
+    names = messages.frame_ids
     same = np.array([each == sensor for each in names])
     if not chosen and not np.all(same):
         first = int(np.argmin(same))
@@ -397,7 +392,7 @@ def imus_of(messages: Messages, name: str, before: int, sensor: str, *, chosen: 
                          f'{names[first]!r}, expected {sensor!r} as before',
                          'capture and refine choose one with --sensor; apply needs a topic for '
                          'each sensor')
-    columns = samples_of(messages)
+    columns = messages.columns
     for key, what in (('reading', 'acceleration'), ('rate', 'angular velocity')):
         values = columns[key] if key == 'reading' else np.nan_to_num(columns[key])
         sound = np.all(np.abs(values) < LARGEST, axis=1)

@@ -28,9 +28,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .bag import (
-    Bag, BLOCK, doubles_at, imus_of, NANO, NUMBERS, open_bag, Received, stamps_of, TEMPERATURE,
-    types_of)
+from .bag import Bag, BLOCK, imus_of, NANO, NUMBERS, open_bag, Received, TEMPERATURE, types_of
 from .names import ZEROS
 from ..errors import InputError
 from ..table import concatenated, CONTEXT, Floats, quantity_key, Recording
@@ -163,7 +161,7 @@ class ContextTopic:
         """Return the times [s] and values of messages; a damaged message is an InputError."""
         if self.msgtype == TEMPERATURE:
             messages = self.bag.joined(block, self.topic, TEMPERATURE)
-            stamps, values = stamps_of(messages), doubles_at(messages, slice(0, 1))[:, 0]
+            stamps, values = messages.stamps, messages.doubles(slice(0, 1))[:, 0]
         else:
             store = types_of(block[0][0].msgdef, self.msgtype, self.bag.ros2)
             read = store.deserialize_cdr if self.bag.ros2 else store.deserialize_ros1
@@ -269,7 +267,7 @@ def _with_clock_and_unit(topic: ContextTopic, imu: str, *, named: bool
     received, of_block = (np.array([stamp for _, stamp, _ in each]) * NANO
                           for each in (of_imu, block))
     if of_imu:
-        late = float(np.median(stamps_of(topic.bag.joined(of_imu, imu)) - received))
+        late = float(np.median(topic.bag.joined(of_imu, imu).stamps - received))
     if not np.median(np.abs(time - of_block - late)) <= _SAME_CLOCK_S:
         topic = replace(topic, late=late)
         notes.append(f'the messages on {what} have no stamp of the clock of the Imu: their '

@@ -224,6 +224,14 @@ class TextLayout:
         has_name = column < len(self.header) and self.header[column]
         return short(self.header[column]) if has_name else str(column + 1)
 
+    def unit(self, column: int) -> str:
+        """Return the text of the unit of a column, which can stand in a row below the header."""
+        unit = meaning(self.header[column]).unit if column < len(self.header) else ''
+        if unit or column >= len(self.units_row):
+            return unit
+        below = self.units_row[column].strip('()[]')
+        return below if any(unit_of(key, below) for key in UNITS) else ''
+
 
 @dataclass(frozen=True)
 class Cells:
@@ -241,46 +249,36 @@ class Cells:
 
 
 @dataclass(frozen=True)
-class Source:
-    """A column of a file: its index, its name, and the text of its unit."""
-
-    index: int
-    name: str
-    unit: str = ''
-
-
-@dataclass(frozen=True)
 class Chosen:
     """
     The columns of a text log that are used, and the maker's layout, if any.
 
-    `sources` are the columns by key of `COLUMNS`; those of ``KEY/`` divide the ones of a key, and
-    ``instance`` is the number of the sensor. The others are indices: of the columns of numbers
-    that each row needs, of those of the `context` that poses may lack, of `labels`, of `dates`
-    (times as text), and of further columns of numbers, the `quantities`.
+    All are indices of columns. `sources` are those of a key of `COLUMNS`; those of ``KEY/`` divide
+    the ones of a key, and ``instance`` is the number of the sensor. The others are the columns of
+    numbers that each row needs, those of the `context` that poses may lack, `dates` (times as
+    text), and further columns of numbers, the `quantities`.
 
     """
 
     layout: TextLayout
-    sources: Mapping[str, tuple[Source, ...]]
+    sources: Mapping[str, tuple[int, ...]]
     maker: LogFormat | None
     needed: tuple[int, ...]
     context: tuple[int, ...]
-    labels: tuple[int, ...]
     dates: tuple[int, ...]
     quantities: Mapping[str, int]
 
     def numbers(self, cells: Cells, key: str) -> Floats:
         """Return the (n, k) numbers of a key as in the file; divided, if its maker says so."""
-        values = np.column_stack([cells.numbers[source.index] for source in self.sources[key]])
+        values = np.column_stack([cells.numbers[k] for k in self.sources[key]])
         for divisor in self.sources.get(f'{key}/', ()):
             with np.errstate(all='ignore'):  # a row divided by 0 is refused later, with its number
-                values /= cells.numbers[divisor.index][:, np.newaxis]
+                values /= cells.numbers[divisor][:, np.newaxis]
         return values
 
     def names(self, key: str) -> list[str]:
         """Return the names of the columns of a key in the file."""
-        return [source.name for source in self.sources[key]]
+        return [*map(self.layout.name, self.sources[key])]
 
 
 def is_number(text: str) -> bool:
@@ -321,41 +319,19 @@ def choose_columns(layout: TextLayout, options: LogOptions) -> Chosen:
     Raise InputError if there is not exactly one accelerometer, or a given column is not there.
 
     """
-    header = layout.header
-    if options.format:
-        maker: LogFormat | None = format_named(options.format, header, str(layout.path))
-    else:
-        maker = recognise(header[:MOST])
-        # Our own names go first, unless the maker's layout says that they are other columns.
-        if maker is not None and set(READING) <= {*header} and not {*READING} <= {*maker.marks}:
-            maker = None
-    given = options.columns
-    if maker is None or set(READING) & given.keys():
-        maker, found = None, _sources(layout, given)
-        counted = counter_of(layout) if options.rate or layout.rate_hz else None
-        if counted and 'time' not in found and 'time' not in given:
-            found['time'] = counted
-    else:
-        check_sensor(header[:MOST], layout.path)
-        spelled = {folded(name): name for name in reversed(header)}
-        theirs = {key: spelled[folded(name)] for key, name in maker.columns.items()
-                  if folded(name) in spelled}
-        ours = {key: theirs.pop(key) for key in OURS if key in theirs}
-        found = _sources(layout, {**ours, **given})
-        found |= {key: column(layout, name) for key, name in theirs.items()}
+    maker, found = _name_columns(layout, options)
     sources = {key: tuple(found[name] for name in own.names) for key, own in COLUMNS.items()
                if found.keys() >= {*own.names}}
-    sources |= {key: (source,) for key, source in found.items() if key not in OURS}
-    index = {key: tuple(source.index for source in own) for key, own in sources.items()}
-    clocks = layout.first(index['time'][0])[:_FIRST_ROWS] if 'time' in index else []
-    dates = index['time'] if clocks and all(map(is_clock, clocks)) else ()
+    sources |= {key: (k,) for key, k in found.items() if key not in OURS}
+    clocks = layout.first(found['time'])[:_FIRST_ROWS] if 'time' in found else []
+    dates = sources['time'] if clocks and all(map(is_clock, clocks)) else ()
     texts = {'label', 'time'} if dates else {'label'}
-    needed = {k for key, which in index.items() if key not in texts for k in which}
-    of_poses = options.partial or bool(OF_POSES & index.keys())
-    context = {k for key in CONTEXT for k in index.get(key, ())} if of_poses else set[int]()
-    used = {k for which in index.values() for k in which}
+    needed = {k for key, which in sources.items() if key not in texts for k in which}
+    of_poses = options.partial or bool(OF_POSES & sources.keys())
+    context = {k for key in CONTEXT for k in sources.get(key, ())} if of_poses else set[int]()
+    used = {k for which in sources.values() for k in which}
     quantities: dict[str, int] = {}  # the other columns of numbers that can be a cause
-    for k, name in enumerate(() if maker else header[:MOST]):
+    for k, name in enumerate(() if maker else layout.header[:MOST]):
         known, cells = meaning(name), layout.first(k)
         if (k not in used and known.quantity in {'', *sources} - {'reading', 'rate', 'time'}
                 and bare_name(name) not in COUNTERS and COMPUTED_WORDS.isdisjoint(known.group)
@@ -364,15 +340,40 @@ def choose_columns(layout: TextLayout, options: LogOptions) -> Chosen:
             quantities.setdefault(quantity_key(name), k)
     return Chosen(
         layout=layout, sources=sources, maker=maker, needed=tuple(sorted(needed - context)),
-        context=tuple(sorted(context)), labels=index.get('label', ()), dates=dates,
-        quantities=quantities)
+        context=tuple(sorted(context)), dates=dates, quantities=quantities)
+
+
+def _name_columns(layout: TextLayout, options: LogOptions
+                  ) -> tuple[LogFormat | None, dict[str, int]]:
+    """Return the maker's layout, if any, and the columns under our names."""
+    header, given = layout.header, options.columns
+    if options.format:
+        maker: LogFormat | None = format_named(options.format, header, str(layout.path))
+    else:
+        maker = recognise(header[:MOST])
+        # Our own names go first, unless the maker's layout says that they are other columns.
+        if maker is not None and set(READING) <= {*header} and not {*READING} <= {*maker.marks}:
+            maker = None
+    if maker is None or set(READING) & given.keys():
+        found = _sources(layout, given)
+        counter = counter_of(layout) if options.rate or layout.rate_hz else None
+        if counter is not None and 'time' not in found and 'time' not in given:
+            found['time'] = counter
+        return None, found
+    check_sensor(header[:MOST], layout.path)
+    spelled = {folded(name): name for name in reversed(header)}
+    theirs = {key: spelled[folded(name)] for key, name in maker.columns.items()
+              if folded(name) in spelled}
+    ours = {key: theirs.pop(key) for key in OURS if key in theirs}
+    found = _sources(layout, {**ours, **given})
+    return maker, found | {key: column(layout, name) for key, name in theirs.items()}
 
 
 def _are_numbers(cells: Sequence[str]) -> bool:
     return all(is_number(cell.replace(',', '.')) for cell in cells)
 
 
-def _sources(layout: TextLayout, given: Mapping[str, str]) -> dict[str, Source]:
+def _sources(layout: TextLayout, given: Mapping[str, str]) -> dict[str, int]:
     """Return columns under our names; `given` are those that the user or a maker names."""
     header = layout.header
     for ours in given:
@@ -389,20 +390,19 @@ def _sources(layout: TextLayout, given: Mapping[str, str]) -> dict[str, Source]:
             if count > 1 and name in OURS:
                 raise InputError(f'{layout.path} has {count} columns {name}, expected one',
                                  'remove or rename the others')
-        found = {**{name: _source(layout, header.index(name)) for own in COLUMNS.values()
+        found = {**{name: header.index(name) for own in COLUMNS.values()
                     if not own.made and {*own.names} <= {*header} for name in own.names}, **found}
     elif not set(READING) <= set(found):
         found = {**_readings(layout), **found}
     if header:
         found = {**_contexts(layout, found), **found}
     # What is not asked for, and holds other text than numbers, does not stand in the way.
-    plain = {ours: source for ours, source in found.items()
-             if ours not in (*RATE, *CONTEXT) or ours in given or source.name == ours
-             or _are_numbers(layout.first(source.index)[:_FIRST_ROWS])}
-    return {ours: source for ours, source in plain.items() if given.get(ours, ours)}
+    return {ours: k for ours, k in found.items() if given.get(ours, ours) and (
+        ours not in (*RATE, *CONTEXT) or ours in given or layout.name(k) == ours
+        or _are_numbers(layout.first(k)[:_FIRST_ROWS]))}
 
 
-def column(layout: TextLayout, theirs: str) -> Source:
+def column(layout: TextLayout, theirs: str) -> int:
     """Return a column by its name, in any case, or by its number."""
     header = layout.header
     same = ([k for k, name in enumerate(header) if name == theirs]
@@ -415,19 +415,10 @@ def column(layout: TextLayout, theirs: str) -> Source:
         raise InputError(f'{layout.path} has {words}, and {len(same) or "no"} '
                          f'{"columns" if same else "column"} {theirs!r}, expected one',
                          f'use a name of the header, or a number from 1 to {layout.width}')
-    return _source(layout, same[0])
+    return same[0]
 
 
-def _source(layout: TextLayout, index: int) -> Source:
-    """Return a column with its unit, which can stand in a row below the header."""
-    unit = meaning(layout.header[index]).unit if index < len(layout.header) else ''
-    if not unit and index < len(layout.units_row):
-        below = layout.units_row[index].strip('()[]')
-        unit = below if any(unit_of(key, below) for key in UNITS) else ''
-    return Source(index, layout.name(index), unit)
-
-
-def _readings(layout: TextLayout) -> dict[str, Source]:
+def _readings(layout: TextLayout) -> dict[str, int]:
     """Return the columns of the accelerometer; those of a table without header by their order."""
     header = layout.header
     if not header:
@@ -436,7 +427,7 @@ def _readings(layout: TextLayout) -> dict[str, Source]:
                              'expected 3 (ax, ay, az), 4 (time first), 5 (temperature last), 7 '
                              '(angular rate last) or 8 (temperature last)', 'add a header line, '
                              'or name them with --columns time=1,ax=2,ay=3,az=4')
-        return {name: Source(k, str(k + 1)) for k, name in enumerate(BY_ORDER[layout.width])}
+        return {name: k for k, name in enumerate(BY_ORDER[layout.width])}
     groups = list(_triples('reading', header).values())
     words = {triple[0]: set(meaning(header[triple[0]]).group) for triple in groups}
     with_gravity = [triple for triple in groups if not FREE_WORDS & words[triple[0]]]
@@ -449,7 +440,7 @@ def _readings(layout: TextLayout) -> dict[str, Source]:
                          'or total acceleration')
     groups = whole or plain or with_gravity or _bare(header)
     if len(groups) == 1:
-        return {name: _source(layout, k) for name, k in zip(READING, groups[0])}
+        return dict(zip(READING, groups[0]))
     if groups:
         names = ' and '.join(', '.join(map(layout.name, triple)) for triple in groups[:3])
         # A name that several columns have is replaced by the number.
@@ -499,8 +490,8 @@ def _bare(header: Sequence[str]) -> list[list[int]]:
     return [[axes[axis][k] for axis in range(3)] for k in range(count)]
 
 
-def _contexts(layout: TextLayout, found: Mapping[str, Source]) -> dict[str, Source]:
-    more: dict[str, Source] = {}
+def _contexts(layout: TextLayout, found: Mapping[str, int]) -> dict[str, int]:
+    more: dict[str, int] = {}
     header = layout.header
     # Columns of times that run, and how finely. A date that stays the same, or a time of the day
     # in whole seconds, is no clock of the samples.
@@ -508,7 +499,7 @@ def _contexts(layout: TextLayout, found: Mapping[str, Source]) -> dict[str, Sour
     different = {k: len(set(texts)) for k, texts in cells.items()
                  if all(is_number(text.replace(',', '.')) or is_clock(text)
                         for text in texts[:_FIRST_ROWS])}
-    different |= {k: max(different.get(other.index, 0), different[k]) for k in different
+    different |= {k: max(different.get(other, 0), different[k]) for k in different
                   for other in _fraction(layout, k).values()}
     clocks = {k: 2 * count >= max(different.values()) for k, count in different.items()
               if count > 1 or len(cells[k]) < _FIRST_ROWS}
@@ -517,35 +508,34 @@ def _contexts(layout: TextLayout, found: Mapping[str, Source]) -> dict[str, Sour
         best = max(clocks, key=lambda k: (
             clocks[k], header[k].casefold() == 'time', {*WORDS['time']}.issuperset(
                 meaning(header[k]).group), bool(meaning(header[k]).unit), -k))
-        more |= {'time': _source(layout, best), **_fraction(layout, best)}
+        more |= {'time': best, **_fraction(layout, best)}
     if RATE[0] not in found:  # the gyro that belongs to the accelerometer, if it is plain
         gyros = _triples('rate', header)
         if len(gyros) > 1:
-            own = set(meaning(found[READING[0]].name).group) if READING[0] in found else set()
+            own = set(meaning(layout.name(found[READING[0]])).group)
             shared = [len(own.intersection(group)) for group in gyros]
             gyros = {group: triple for (group, triple), count in zip(gyros.items(), shared)
                      if count == max(shared) and shared.count(count) == 1}
-        more |= {name: _source(layout, k) for triple in gyros.values()
-                 for name, k in zip(RATE, triple)}
+        more |= {name: k for triple in gyros.values() for name, k in zip(RATE, triple)}
     for key in CONTEXT:
         which = [*columns_named(key, header)]
         if key not in found and len(which) == 1:
-            more[key] = _source(layout, which[0])
+            more[key] = which[0]
     return more
 
 
-def counter_of(layout: TextLayout) -> Source | None:
+def counter_of(layout: TextLayout) -> int | None:
     """Return the column that counts the samples, or None."""
-    return next((_source(layout, k) for k, name in enumerate(layout.header[:MOST])
+    return next((k for k, name in enumerate(layout.header[:MOST])
                  if bare_name(name) in COUNTERS and len(layout.first(k)) >= _FIRST_ROWS
                  and layout.step(k) > 0.0), None)
 
 
-def _fraction(layout: TextLayout, best: int) -> dict[str, Source]:
+def _fraction(layout: TextLayout, best: int) -> dict[str, int]:
     """Return the column of the nanoseconds beside whole seconds, as ROS stamps have it."""
     known = meaning(layout.header[best])
     if unit_of('time', known.unit) == ('s', 1.0):
         for k, other in columns_named('time', layout.header).items():
             if other.group == known.group and unit_of('time', other.unit) == ('ns', 1e-9):
-                return {FRACTION: _source(layout, k)}
+                return {FRACTION: k}
     return {}

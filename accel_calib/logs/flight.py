@@ -50,7 +50,7 @@ from .autopilot import (
     sound, vectors)
 from .names import MICRO, names_of, PX4_FIELDS
 from ..errors import InputError
-from ..table import Autopilot
+from ..table import Autopilot, Floats
 from ..text import counted
 
 PX4_MESSAGES, ARDUPILOT_MESSAGES = tuple(PX4_FIELDS), ('IMU', 'ACC')
@@ -85,7 +85,7 @@ class _WholeReads(io.BufferedReader):
         return data
 
 
-@np.errstate(invalid='ignore', over='ignore')  # rows that are not numbers are left out
+@np.errstate(divide='ignore', invalid='ignore', over='ignore')  # such rows are left out
 def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     """
     Read the accelerations of one sensor of a PX4 log.
@@ -100,19 +100,7 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
              if message.name in _NEEDED and _NEEDED[message.name] <= set(message.fields)]
     choice = choose(known, PX4_MESSAGES, topic, sensor, str(path))
     chosen = choice.message
-    fields, time = chosen.fields, chosen.time
-    columns = {key: vectors(fields, names_of(pattern))
-               for key, pattern in PX4_FIELDS[chosen.name].items()}
-    valid = np.ones(len(time), dtype=bool)
-    if _RELATIVE in fields:
-        relative = fields[_RELATIVE].astype(float)
-        time, valid = time + relative * MICRO, relative != _INVALID
-    for key in [key for key in columns if key.endswith('/')]:
-        seconds = columns.pop(key) * MICRO
-        valid &= seconds[:, 0] > 0.0
-        columns[key[:-1]] /= np.where(seconds > 0.0, seconds, 1.0)
-    columns, invalid = sound(
-        chosen, {'time': time, **columns}, 'PX4 marks them as invalid', valid)
+    columns, invalid = sound(chosen, _px4_columns(chosen), 'PX4 marks them as invalid')
     time = columns['time']
     if not len(time):
         raise InputError(f'{path}: no row of {chosen} is valid, expected samples',
@@ -136,6 +124,21 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     correction = partial(px4_correction, parameters, autopilot, release, chosen.name)
     return choice.log(columns, autopilot, parameters, None if is_raw else correction,
                       (*notes, *invalid))
+
+
+def _px4_columns(message: Message) -> dict[str, Floats]:
+    """Return the times, readings and rates of a message; the times of invalid rows are NaN."""
+    columns = {key: vectors(message.fields, names_of(pattern))
+               for key, pattern in PX4_FIELDS[message.name].items()}
+    time = message.time
+    if _RELATIVE in message.fields:
+        relative = message.fields[_RELATIVE].astype(float)
+        time = np.where(relative != _INVALID, time + relative * MICRO, np.nan)
+    for key in [key for key in columns if key.endswith('/')]:
+        seconds = columns.pop(key) * MICRO
+        time = np.where(seconds[:, 0] > 0.0, time, np.nan)
+        columns[key[:-1]] /= seconds
+    return {'time': time, **columns}
 
 
 def _px4_messages(path: Path

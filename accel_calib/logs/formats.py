@@ -259,27 +259,33 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
                 count = max(count, int(text.size / width / max(text.characters, 1) * count))
         else:
             rows = concatenated([head, *blocks])
-            holes = {} if options.partial else {
-                key: np.flatnonzero(~np.isfinite(rows[key]))
-                for key in (*CONTEXT, *rows.quantities) if key in rows}
-            lacking = [key for key, empty in holes.items() if len(empty)]
-            quantities.findings += [
-                Finding('columns', f'not used, because {len(holes[key])} of {len(rows)} cells are '
-                        f'not numbers: {key}', 'fill in these cells, or remove their rows',
-                        rows=tuple(rows.row[holes[key]].tolist())) for key in lacking]
             if 'time' not in rows and are_samples(rows.columns):
                 raise InputError(
                     f'{path} has no times, but its {len(rows)} rows look like samples of a '
                     'recording, expected a column time', 'state the samples per second with '
                     '--rate HZ, or name the column with --columns time=NAME; if each row is a '
                     'pose, add a column orientation')
-            poses = replace(rows.without_columns(*lacking), findings=tuple(quantities.findings))
+            poses = rows if options.partial else _without_holes(rows, quantities.findings)
+            poses = replace(poses, findings=tuple(quantities.findings))
             samples, count = _as_samples(path, poses), len(poses)
     rate = [] if quantities.rate_hz is None else [f'{quantities.rate_hz:g} Hz (stated)']
     return OpenLog(
         blocks=samples, samples=count, units=quantities.units, sensor=head.sensor,
         read_as=', '.join([*quantities.said, *rate]), poses=poses,
         noted=lambda: (*text.notes, *quantities.all_notes), findings=tuple(quantities.findings))
+
+
+def _without_holes(poses: Poses, findings: list[Finding]) -> Poses:
+    """Return poses without the columns of the context that have holes, which are findings."""
+    for key in [key for key in (*CONTEXT, *poses.quantities) if key in poses]:
+        holes = np.flatnonzero(~np.isfinite(poses[key]))
+        if len(holes):
+            findings.append(Finding(
+                'columns', f'not used, because {len(holes)} of {len(poses)} cells are not '
+                f'numbers: {key}', 'fill in these cells, or remove their rows',
+                rows=tuple(poses.row[holes].tolist())))
+            poses = poses.without_columns(key)
+    return poses
 
 
 def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:

@@ -143,12 +143,10 @@ class Quantities:
     def columns(self, cells: Cells, source: str, *, partial: bool = False
                 ) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:
         """Return the columns of a block in our units, and its row numbers; see `check_values`."""
-        if self.instance is not None:
-            cells = cells.take(self.chosen.numbers(cells, 'instance')[:, 0] == self.instance)
-        columns: dict[str, NDArray[Any]] = {}
+        cells, columns = self.of_instance(cells), dict[str, NDArray[Any]]()
         for key, own in self.chosen.sources.items():
             if key == 'label':
-                columns[key] = np.array([*map(one_line, cells.texts[own[0].index])], str)
+                columns[key] = np.array([*map(one_line, cells.texts[own[0]])], str)
             elif key == 'time':
                 columns[key] = self.clock.continued(cells)
             elif key in COLUMNS:
@@ -162,6 +160,12 @@ class Quantities:
             columns['time'] = (cells.row - 1) / self.rate_hz
         check_values(columns, source, partial=partial)
         return columns, cells.row
+
+    def of_instance(self, cells: Cells) -> Cells:
+        """Return the rows of the sensor that is read."""
+        if self.instance is None:
+            return cells
+        return cells.take(self.chosen.numbers(cells, 'instance')[:, 0] == self.instance)
 
     def numbers(self, cells: Cells, key: str) -> Floats:
         """Return the numbers of a key, (n, k), with their sign, in the unit of the file."""
@@ -180,16 +184,8 @@ def decide_quantities(columns: Chosen, first: Cells, options: LogOptions) -> Qua
         made.notes += [columns.maker.note] if columns.maker.note else []
     made.said += columns.layout.words
     if 'instance' in columns.sources:
-        there = np.unique(columns.numbers(first, 'instance')).tolist()
-        names = [f'{each:g}' for each in there]
-        if options.sensor and options.instance not in names:
-            raise InputError(f'{columns.layout.path} has the sensors {", ".join(names)}, expected '
-                             f'{options.sensor}', 'choose one of them with --sensor')
-        made.instance = float(options.instance) if options.sensor else there[0]
-        if len(there) > 1 and not options.sensor:
-            made.notes.append(f'the log has the sensors {", ".join(names)}; sensor {names[0]} is '
-                              'read: choose another with --sensor')
-        first = first.take(columns.numbers(first, 'instance')[:, 0] == made.instance)
+        _choose_instance(made, columns.numbers(first, 'instance')[:, 0], options)
+        first = made.of_instance(first)
     for key in ('reading', 'rate'):
         if key in columns.sources and (modulus := modulus_of(columns.numbers(first, key))):
             made.modulus[key] = modulus
@@ -216,6 +212,19 @@ def decide_quantities(columns: Chosen, first: Cells, options: LogOptions) -> Qua
     _decide_context(made, first)
     made.findings += made.clock.findings
     return made
+
+
+def _choose_instance(made: Quantities, numbers: Floats, options: LogOptions) -> None:
+    """Choose one of the sensors whose rows alternate, by their numbers; by default the lowest."""
+    there = np.unique(numbers).tolist()
+    names = [f'{each:g}' for each in there]
+    if options.sensor and options.instance not in names:
+        raise InputError(f'{made.chosen.layout.path} has the sensors {", ".join(names)}, expected '
+                         f'{options.sensor}', 'choose one of them with --sensor')
+    made.instance = float(options.instance) if options.sensor else there[0]
+    if len(there) > 1 and not options.sensor:
+        made.notes.append(f'the log has the sensors {", ".join(names)}; sensor {names[0]} is '
+                          'read: choose another with --sensor')
 
 
 def _find_gyro(made: Quantities, first: Cells) -> None:
@@ -268,7 +277,7 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions, *, samp
     columns, maker = made.chosen, made.chosen.maker
     path, of_file = columns.layout.path, columns.layout.about.get('units', '')
     found = ({(maker.units, maker.scales.get('reading', 1.0))} if maker and maker.units else
-             {unit_of('reading', source.unit) for source in columns.sources['reading']})
+             {unit_of('reading', columns.layout.unit(k)) for k in columns.sources['reading']})
     if len(found) > 1:
         raise InputError(f'{path} has the columns {", ".join(columns.names("reading"))} in '
                          'several units, expected one unit',
@@ -338,7 +347,8 @@ def _words(columns: Chosen, rests: Rests, units: Units, factor: float, *, stated
         return f'{words}, {value}{counts} {about} (native)'
     if factor == 1.0:
         return f'{words} in {name}'
-    unit = columns.sources['reading'][0].unit or {1e-3: 'mg'}.get(factor, f'{factor:g} {name}')
+    unit = columns.layout.unit(columns.sources['reading'][0]) or (
+        'mg' if factor == 1e-3 else f'{factor:g} {name}')
     return f'{words} in {unit} -> {name}' if columns.maker is None else f'{words} -> {name}'
 
 
@@ -465,7 +475,7 @@ def _decide_rate(made: Quantities, first: Cells) -> None:
     if columns.maker is not None and 'gx' in columns.maker.columns:
         made.scales['rate'] = columns.maker.scales.get('rate', 1.0), 0.0
         return
-    stated = unit_of('rate', columns.sources['rate'][0].unit)
+    stated = unit_of('rate', columns.layout.unit(columns.sources['rate'][0]))
     rests = None if stated else _units_at_rest(made, first)
     largest = float(np.quantile(np.abs(made.numbers(first, 'rate')), 0.999))
     own = columns.names('rate')[0] == 'gx' and largest < _LARGEST_RATE
@@ -510,25 +520,25 @@ def _units_at_rest(made: Quantities, first: Cells) -> dict[str, float] | None:
 
 
 def _decide_context(made: Quantities, first: Cells) -> None:
-    columns = made.chosen
+    columns, layout = made.chosen, made.chosen.layout
     for key, ours in (('temperature', '°C'), ('supply_voltage', 'V')):
-        for source in columns.sources.get(key, ()):
-            unit, factor = unit_of(key, source.unit) or ('', 1.0)
+        for k in columns.sources.get(key, ()):
+            name, (unit, factor) = layout.name(k), unit_of(key, layout.unit(k)) or ('', 1.0)
             if unit not in ('', ours):
                 made.scales[key] = factor, ZEROS.get(unit, 0.0)
-                made.said.append(f'{source.name} in {unit} -> {ours}')
+                made.said.append(f'{name} in {unit} -> {ours}')
             values = columns.numbers(first, key)
             known = values[np.isfinite(values)]
             if unit or key != 'temperature' or columns.maker is not None or not len(known):
                 continue
-            middle, own = float(np.median(known)), source.name == key and columns.layout.header
+            middle, own = float(np.median(known)), name == key and layout.header
             if _LIKELY_TEMPERATURE_C[0] <= middle <= _LIKELY_TEMPERATURE_C[1]:
-                made.said += [] if own else [f'{source.name} in °C (assumed)']
+                made.said += [] if own else [f'{name} in °C (assumed)']
             else:
-                _leave_out(made, key, f'the temperature {source.name} has values of about '
-                           f'{middle:.4g} in a unit that is not known, and is',
+                _leave_out(made, key, f'the temperature {name} has values of about {middle:.4g} '
+                           'in a unit that is not known, and is',
                            'state its unit in the name, such as temperature_K')
-    names = [name for name in columns.layout.header[:MOST]
+    names = [name for name in layout.header[:MOST]
              if meaning(name).quantity == 'temperature']
     if names and 'temperature' not in columns.sources:
         made.notes.append(f'not used, though the names look like temperatures: {shown(names)}; '

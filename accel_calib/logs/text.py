@@ -165,13 +165,9 @@ def find_layout(path: Path, head: Sequence[str], options: LogOptions, encoding: 
     below = [k for k in cells if k >= first]
     start = next((k for k in below if any(map(_LIKE_NUMBER.fullmatch, cells[k]))),
                  below[0] if below else len(head))
-    values = [{float(cell) for cell in cells[k]} if all(map(is_number, cells[k])) else set()
-              for k in below[below.index(start):][:2]] if below else []
-    rate_hz = None
-    if not header and [*map(len, values)] == [1, 1] and len(cells[start]) >= len('xyz'):
-        (begun,), (rate,) = values  # Empatica writes the time and the rate into each column
-        if begun > EPOCH_S[0] and RATES_HZ[0] <= rate <= RATES_HZ[1]:
-            rate_hz, start = rate, below[2] if len(below) > 2 else start
+    rate_hz = None if header else _rate_above([cells[k] for k in below if k >= start][:2])
+    if rate_hz is not None:
+        start = below[2] if len(below) > 2 else start
     passed = [short(head[k]) for k in plain if k < start and k != at]
     skipped = f'skipped {counted(len(passed), "line")} before the table'
     notes = [f'{skipped}{":" if len(passed) == 1 else ", the first is"} {each!r}'
@@ -190,6 +186,15 @@ def find_layout(path: Path, head: Sequence[str], options: LogOptions, encoding: 
         units_row=units_row, width=_width(header, rows), start=start, encoding=encoding,
         about=_about(path, head), notes=tuple(notes),
         sample=tuple(map(tuple, rows[:_TRIED_LINES])), rate_hz=rate_hz)
+
+
+def _rate_above(rows: Sequence[Sequence[str]]) -> float | None:
+    """Return the rate in two rows: Empatica writes time and rate into each column above all."""
+    values = [{float(cell) for cell in row} for row in rows if all(map(is_number, row))]
+    if [*map(len, values)] != [1, 1] or len(rows[0]) < len('xyz'):
+        return None
+    (begun,), (rate,) = values
+    return rate if begun > EPOCH_S[0] and RATES_HZ[0] <= rate <= RATES_HZ[1] else None
 
 
 _Found = tuple[Dialect, tuple[str, ...], int, int]
@@ -377,7 +382,7 @@ class TextTable:
         self._line += len(lines)
         numbers = dict(zip(numeric, values.reshape(-1, len(numeric)).T, strict=True))
         texts = {k: np.array([dialect.cells(line)[k] for line in rows], object)
-                 for k in (*self.columns.labels, *self.columns.dates)}
+                 for k in (*self.columns.sources.get('label', ()), *self.columns.dates)}
         return Cells(numbers, texts, number)
 
     def _parsed(self, lines: list[str]) -> Floats | None:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from .columns import (
     Cells, Chosen, CLOCK, columns_named, counter_of, EPOCH_S, FRACTION, LogOptions, RATES_HZ,
-    Source, TextLayout)
+    TextLayout)
 from .names import bare_name, COUNTERS, READING, TICKS, unit_of, UNITS
 from ..errors import InputError
 from ..finding import Finding
@@ -182,52 +182,52 @@ def check_order(time: Floats, source: str) -> None:
 
 def _stated_clock(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
     """Return the clock with the unit that is stated, or found from the rate."""
-    (source,), layout = columns.sources['time'], columns.layout
-    rate_hz = options.rate or layout.rate_hz
-    if rate_hz is not None and bare_name(source.name) in COUNTERS:
+    (column,), layout = columns.sources['time'], columns.layout
+    name, rate_hz = layout.name(column), options.rate or layout.rate_hz
+    if rate_hz is not None and bare_name(name) in COUNTERS:
         return Clock(columns, 1.0 / rate_hz, tuple(2.0**bits / rate_hz for bits in (8, 16, 32)),
-                     f'{source.name} at {rate_hz:g} Hz (stated) -> s')
+                     f'{name} at {rate_hz:g} Hz (stated) -> s')
     if options.rate is not None:
         raise InputError(f'{layout.path} has times, but --rate is {options.rate:g}',
                          'remove --rate, or leave the times out with --columns time=')
     if columns.dates:
-        match = CLOCK.fullmatch(first.texts[source.index][0])
+        match = CLOCK.fullmatch(first.texts[column][0])
         dated = match is not None and match[1] is not None
         step = _step_of(Clock(columns).seconds(first))
         rate = f' ({1.0 / step:.3g} Hz)' if step > 0.0 else ''
         return Clock(columns, periods=() if dated else (_DAY_S,), words=(
-            f'{source.name}: {"dates" if dated else "times of the day"}{rate} -> s'))
+            f'{name}: {"dates" if dated else "times of the day"}{rate} -> s'))
     stamps = columns.numbers(first, 'time')[:, 0]
     back = np.count_nonzero(np.diff(stamps) < 0.0)
     forth = np.count_nonzero(np.diff(stamps) > 0.0)
     if not layout.header and back > _MOST_BACK * (len(stamps) - 1) and forth > (
             1.0 - _REVERSED) * back:
-        raise InputError(f'{layout.path} has no header line, and column '
-                         f'{source.name} does not increase, expected times',
+        raise InputError(f'{layout.path} has no header line, and column {name} does not increase, '
+                         'expected times',
                          'add a header line, or name the columns with --columns ax=1,ay=2,az=3')
     unit = _unit_of_time(columns, first, stamps)
     scale = {**_UNITS, _TICK: 1e-4}[unit]
     step = scale * _step_of(stamps)
-    named = f'column {source.name}' if source.name.isdecimal() else source.name
+    named = f'column {name}' if name.isdecimal() else name
     rate = f' ({1.0 / step:.3g} Hz)' if step > 0.0 else ''
     words = f'{named} in {unit}{rate}{"" if unit == "s" else " -> s"}'
     agrees = not layout.rate_hz or not step > 0.0 or any(
-        1.0 / _AGREES < 1.0 / step / each < _AGREES for each in _rates_beside(layout, source))
-    doubts = () if agrees else (f'{source.name} has {1.0 / step:.4g} samples per second, but the '
+        1.0 / _AGREES < 1.0 / step / each < _AGREES for each in _rates_beside(layout, column))
+    doubts = () if agrees else (f'{name} has {1.0 / step:.4g} samples per second, but the '
                                 f'file states {layout.rate_hz:g} Hz',)
     return Clock(columns, scale, _PERIODS_S.get(unit, ()), words, doubts)
 
 
 def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
-    (source,), layout = columns.sources['time'], columns.layout
+    (column,), layout = columns.sources['time'], columns.layout
     of_maker = columns.maker and columns.maker.scales.get('time')
     if of_maker:
         return next(name for name, factor in _UNITS.items() if factor == of_maker)
-    stated = unit_of('time', source.unit)
+    stated = unit_of('time', layout.unit(column))
     if stated:
         return stated[0]
     step, of_poses = _step_of(stamps), 'count' in columns.sources
-    if layout.header and source.name == 'time' and step < (
+    if layout.header and layout.name(column) == 'time' and step < (
             _POSES_FAR_S if of_poses else _FAR_S):
         is_marked = bool(layout.about) or of_poses
         is_ours = is_marked or columns.names('reading') == [*READING]
@@ -242,14 +242,18 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
             is_ours = not np.mean(scatter > _MOVES * at_rest) > _MOVING
         if is_ours:
             return 's'
-    # A unit with a plausible rate, best one that the file states; else s.
-    units = TICKS.get(bare_name(source.name), _UNITS)
-    beside = _rates_beside(layout, source)
-    if not step > 0.0:
-        return 's'
+    return _likely_unit(columns, first, stamps) if step > 0.0 else 's'
+
+
+def _likely_unit(columns: Chosen, first: Cells, stamps: Floats) -> str:
+    """Return the unit with a plausible rate, best one that the file states; else s."""
+    (column,), layout = columns.sources['time'], columns.layout
+    step, of_poses = _step_of(stamps), 'count' in columns.sources
+    units = TICKS.get(bare_name(layout.name(column)), _UNITS)
     rates = {name: 1.0 / (step * unit) for name, unit in units.items()}
     plausible = [name for name, rate in rates.items() if RATES_HZ[0] * 0.9 <= rate
                  <= RATES_HZ[1] * 1.1]
+    beside = _rates_beside(layout, column)
     agreeing = [name for name, rate in rates.items()
                 if any(1.0 / _AGREES < rate / each < _AGREES for each in beside)]
     since_1970 = [name for name in plausible
@@ -269,15 +273,15 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
                key=lambda name: abs(math.log(rates[name] / usual)))
 
 
-def _rates_beside(layout: TextLayout, time: Source) -> list[float]:
+def _rates_beside(layout: TextLayout, time: int) -> list[float]:
     """Return the rates of the rows that the file states [Hz]: in words, or by another clock."""
     rates = []
     counted = counter_of(layout)
     if layout.rate_hz is not None:
-        rates.append(layout.rate_hz / (layout.step(counted.index) if counted else 1.0))
+        rates.append(layout.rate_hz / (1.0 if counted is None else layout.step(counted)))
     for k, known in columns_named('time', layout.header).items():
         unit, step = unit_of('time', known.unit), layout.step(k)
-        if unit is not None and k != time.index and step > 0.0:
+        if unit is not None and k != time and step > 0.0:
             rates.append(1.0 / (unit[1] * step))
     return rates
 

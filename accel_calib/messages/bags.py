@@ -31,8 +31,7 @@ from ..calibration import Calibration, on_topics
 from ..disk import check_regular
 from ..errors import InputError
 from ..logs import (
-    BAG, doubles_at, IMU_DOUBLES, imus_of, joined, LogOptions, messages_of, open_bag, parts_of,
-    Progress, rewritten)
+    BAG, IMU_DOUBLES, imus_of, joined, LogOptions, messages_of, open_bag, parts_of, Progress)
 from ..pipeline import Correction
 from ..table import check_units, Recording
 from ..units import Units, units_of
@@ -151,11 +150,11 @@ class _Imus:
         known = self.correction.context(samples.with_columns(**{
             key: np.interp(columns['time'], *track)
             for key, track in self.known['tracks'].items()}))
-        doubles = doubles_at(messages, slice(0, IMU_DOUBLES))
+        doubles = messages.doubles(slice(0, IMU_DOUBLES))
         with np.errstate(over='ignore', invalid='ignore'):  # damaged numbers become infinite
             new = corrected(own, doubles, known, scale=self.scale)
         self.done += len(messages)
-        return rewritten(messages, new, output_frame(own, sensor) if own.is_levelled else None)
+        return messages.rewrite(new, output_frame(own, sensor) if own.is_levelled else None)
 
 
 def _copy(imus: _Imus, parts: Iterator[Any], folder: Path, out: Path, progress: Progress

@@ -35,7 +35,7 @@ from ..calibration import on_topics
 from ..errors import AccelCalibError, InputError
 from ..logs import (
     ACCELERATION, field_of, IMU_DOUBLES, joined, Layout, layout_of, LITTLE_ENDIAN, NAME_AT,
-    named_topics, samples_of, THREE, topic_and_field)
+    named_topics, THREE, topic_and_field)
 from ..messages import motion_of, output_frame, Rewriter, Triple
 from ..session import Around, BATCH, CalibratorSettings, columns_of, Session
 from ..table import Floats
@@ -296,7 +296,7 @@ class Stream:
         if self._waiting:
             messages, self._waiting = self._waiting, []
             contexts, self._contexts = self._contexts, []
-            found = samples_of(joined(messages, IMU_DOUBLES, 'imu/data_raw'))
+            found = joined(messages, IMU_DOUBLES, 'imu/data_raw').columns
             runs = [(known, len([*same])) for known, same in groupby(contexts)]
             around = np.repeat([[known.get(column, math.nan) for column in self._columns]
                                 for known, _ in runs], [count for _, count in runs], axis=0)

@@ -10,14 +10,14 @@ from typing import Any
 
 import accel_calib as ac
 from accel_calib.calibration import Calibration, fit_poses, level, SampleNoise
-from accel_calib.logs import doubles_at, joined, layout_of, rewritten, samples_of
+from accel_calib.logs import joined, layout_of
 from accel_calib.messages import corrected, motion_of, output_frame, Rewriter
 from accel_calib.session import diagnostics, progress
 from accel_calib.units import units_of
 from driven import Driver
 from golden.figures import attempt, of_next_pose, those
 from golden.inputs import G, samples
-from inside import figures as health_figures, frame_ids, layout_with, Model, stamps_of
+from inside import figures as health_figures, layout_with, Model
 import numpy as np
 
 SENSOR: dict[str, Any] = {'offset': np.array([0.03, -0.02, 0.04]), 'axis_gain': np.array(
@@ -126,14 +126,13 @@ def messages() -> Any:
         every, large = joined(raws, 37, 'imu'), [
             raws[0][:-96] + struct.pack('<3d', 0.0, size, 0.0) + raws[0][-72:]
             for size in (np.nan, 900.0, 990.0, -1100.0)]
-        known = {'time': stamps_of(every), 'temperature': 20.0 + 2.0 * np.arange(6.0),
-                 'rate': samples_of(every)['rate']}
+        known = {'time': every.stamps, 'temperature': 20.0 + 2.0 * np.arange(6.0),
+                 'rate': every.columns['rate']}
         found[frame_id] = {
-            'single': single, 'together': corrected(calibration, doubles_at(every, slice(0, 37)),
+            'single': single, 'together': corrected(calibration, every.doubles(slice(0, 37)),
                                                     known), 'layout': layout, 'frame': to,
-            'ids': frame_ids(every), 'samples': samples_of(every), 'renamed': [
-                each[:48] for each in rewritten(
-                    every, doubles_at(every, slice(0, 37)), 'other')][:2],
+            'ids': every.frame_ids, 'samples': every.columns, 'renamed': [
+                each[:48] for each in every.rewrite(every.doubles(slice(0, 37)), 'other')][:2],
             'motion': motion_of(raws[0], layout, np.array([0.1, 0.2, 9.8]))[-32:], 'large': [
                 isinstance(attempt(write, each, {'temperature': 20.0}), bytes) for each in large]}
     raw = next(_messages('imu', 1))
@@ -143,9 +142,9 @@ def messages() -> Any:
     ros1 = raw[:12] + struct.pack('<I', 3) + b'imu' + raw[-296:]
     for name, raws, ros2 in (('big endian', [raw, swapped], True), ('ROS 1', [ros1], False)):
         made = joined(raws, 37, 'imu', ros2=ros2)
-        found[name] = [stamps_of(made), doubles_at(made, slice(25, 28)), frame_ids(made),
-                       [each[:40] for each in rewritten(
-                           made, doubles_at(made, slice(0, 37)), 'longer_name')]]
+        found[name] = [made.stamps, made.doubles(slice(25, 28)), made.frame_ids,
+                       [each[:40] for each in made.rewrite(
+                           made.doubles(slice(0, 37)), 'longer_name')]]
     found['layouts'] = [layout_with(each) for each in ('', 'imu', 'imu_link', 'übung')]
     found['damaged'] = [layout_of(each) is None for each in (
         raw, raw[:-1], raw + b'\0', b'\0\0' + raw[2:], raw[:12] + b'\0' + raw[13:], raw[:20])]
