@@ -125,9 +125,6 @@ def test_axes_of_a_driver_are_named_after_two_rests_and_poses_are_asked_for_as_t
         driver = Driver(sensor=words[4:9])
         person = Person(driver, reading(axes))
         person.follow(seconds=25.0)
-        assert driver.shown is not None
-        asked = next_step(driver.session.state).direction
-        np.testing.assert_allclose(driver.shown.asked.direction, asked)
         assert words in driver.logged('warning')
         lines = driver.logged('info').splitlines()
         missed = [line for line in lines if line.startswith('asked for ')]
@@ -215,6 +212,44 @@ def test_no_step_is_named_while_the_rating_is_being_computed() -> None:
     action = next_step(driver.session.state)
     assert (action.kind, action.text) == ('', '')
     assert not [line.words for line in driver.log[lines:] if 'next: ' in line.words]
+
+
+def test_only_a_rest_after_a_request_is_compared_with_it_and_a_rating_is_in_the_level() -> None:
+    driver = Driver(confirm=True)
+    person = Person(driver, reading())
+    for up in (*np.eye(3), *-np.eye(3)):
+        person.rest(up)
+    driver.ask('fit')
+    lines, missed = len(driver.log), driver.sensor.guide.missed
+    for up in spread_directions(10):
+        person.rest(up)
+    assert next_step(driver.session.state).kind == 'accept'
+    driver.ask('save')
+    levels = driver.finding('calibration').level, conditions(driver.session.state)[0].level
+    assert {driver.sensor.rating.name, *levels} == {'USABLE'}
+    driver.ask('fit')
+    driver.ask('save')
+    assert next_step(driver.session.state).kind == 'level'
+    person.rest(person.flat)
+    assert driver.sensor.guide.missed == missed
+    assert not [line.words for line in driver.log[lines:] if 'asked for' in line.words]
+
+
+def test_a_sensor_at_rest_does_not_turn_and_a_quick_turn_does_not_remove_gravity() -> None:
+    driver, rng = Driver(), np.random.default_rng(4)
+
+    def feed(up: Any) -> None:
+        driver.feed(GRAVITY * (np.array(up) + 0.01 * rng.normal(size=(len(up), 3))))
+        driver.tick()
+        assert conditions(driver.session.state)[0].step in ('', 'poses')
+        assert 'turning' not in next_step(driver.session.state).text
+
+    for seconds in (0.4, 0.8, 0.3, 0.9):
+        feed([[0.0, 0.0, 1.0]] * 200)
+        driver.stamp += seconds
+        feed([[0.0, 0.0, 1.0]] * 20)
+    angle = np.linspace(0.0, np.pi, 15)
+    feed(np.column_stack([np.sin(angle), 0.0 * angle, np.cos(angle)]))
 
 
 def test_words_and_direction_come_from_one_pose() -> None:

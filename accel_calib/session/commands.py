@@ -28,8 +28,7 @@ from .store import writing_advice
 from .use import adopt, Fitted, Holder, rate, show_poses
 from .worker import Compute, Files, nothing, Parse, Part, Task
 from ..calibration import (
-    Calibration, fit_partial, gyro_bias_of_rest, level, mounting_only, plan_session,
-    set_heading as with_heading)
+    Calibration, fit_partial, gyro_bias_of_rest, level, mounting_only, set_heading as with_heading)
 from ..effects import Model
 from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
 from ..findings import angle_words, difference_words
@@ -77,9 +76,7 @@ def capture_pose(session: Holder) -> Task:
     if session.state.computing:
         yield Files(nothing)
         return f'{words}; the next pose is on ~/poses after the computation that is running'
-    plan = yield Compute(plan_session, poses, session.state.units, session.state.settings.model)
-    if session.sensor.live is sensor.live:
-        session.change_sensor(guide=session.sensor.guide.choose(plan))
+    yield Compute(nothing)  # until the next pose is chosen
     return f'{words}{next_words(session.state)}'
 
 

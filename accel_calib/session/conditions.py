@@ -142,8 +142,9 @@ def _feasible_step(state: State) -> Finding:
                            command='calibrate_at_rest')
         if turning := slow_turn(state):
             step = replace(step, text=f'{turning}; {step.text}')
-    missing = state.sensor.calibration is None and step.level == 'GOOD'
-    return replace(step, level='USABLE') if missing else step
+    rating = state.sensor.rating
+    is_good = state.sensor.calibration is not None and (rating is None or rating.name == 'GOOD')
+    return step if is_good or step.level != 'GOOD' else replace(step, level='USABLE')
 
 
 def _ordinary_step(state: State) -> Finding:

@@ -87,6 +87,9 @@ class Session(Holder):
         if settings.model != before.model:
             self.change_sensor(guide=self.sensor.guide.choose(None))
             show_poses(self, store=False)
+        if (settings.output_frame_id, settings.rotate) != (
+                before.output_frame_id, before.rotate):
+            self._show_frame()
 
     def tick(self) -> None:
         """Check the stream, and try to lock the files; to be called about once per second."""
@@ -244,16 +247,16 @@ class Session(Holder):
     # The sensor and its files
 
     def _show_frame(self) -> None:
-        """Show poses and mounting in the frame of the sensor, which was not known before."""
-        frame_id = self.state.frame_id
-        if frame_id and frame_id == self.state.settings.output_frame_id:
+        """Show poses and mounting in the frames, which have changed."""
+        frame_id, settings = self.state.frame_id, self.state.settings
+        if frame_id and settings.rotate and frame_id == settings.output_frame_id:
             self.log('warning', f'output_frame_id is {frame_id!r}, the frame of the sensor: TF '
                      'turns levelled messages twice; choose another output_frame_id, or set '
                      'rotate to false')
         show_mounting(self)
         plan = self.sensor.guide.plan
         if plan is not None:
-            self.events.append(ShowPoses(plan.up, plan.asked, frame_id or ''))
+            self.events.append(ShowPoses(plan.up, frame_id or ''))
 
     def _begin(self, run: Callable[[Task], object]) -> bool:
         """

@@ -383,21 +383,19 @@ class State:
         stamp = self.statistics.stamp
         return {**self.around.filled, **({} if math.isnan(stamp) else {'time': stamp})}
 
-    @cached_property
-    def applied(self) -> Calibration | None:
-        """Return the calibration in use in the frame of messages, or without the mounting."""
-        calibration = self.sensor.calibration
-        if calibration is None or not self.settings.rotate:
-            return calibration and calibration.in_sensor_frame
-        return on_topics(calibration, self.settings.frame)
+    def on_topics(self, calibration: Calibration) -> Calibration:
+        """Return a calibration in the frame of messages, or without the mounting."""
+        return (on_topics(calibration, self.settings.frame) if self.settings.rotate
+                else calibration.in_sensor_frame)
 
     @cached_property
     def gravity(self) -> Floats | None:
         """Corrected force of the last rest, (3,) [m/s²]; None if it cannot be corrected."""
-        rest, applied = self.sensor.rest, self.applied
+        rest, calibration = self.sensor.rest, self.sensor.calibration
         context = None if rest is None else self.sensor.known_context(rest)
-        if rest is None or applied is None or context is None:
+        if rest is None or calibration is None or context is None:
             return None
+        applied = self.on_topics(calibration)
         force = applied.correct(rest.mean[np.newaxis], context)[0]
         return force * output_scale(applied, self.settings.gravity)
 
