@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 
 from . import use
-from .conditions import next_words, thermometer_words
+from .conditions import next_words, way_of
+from .poses import Guide
 from .state import Sensor, State
 from .store import writing_advice
 from .use import adopt, Fitted, Holder, rate, show_poses
@@ -142,7 +143,7 @@ def fit(session: Holder) -> Part[Fitted]:
 def refine(session: Holder) -> Part[Fitted]:
     """Refine the calibration."""
     state = session.state
-    hint = '' if 'temperature' in state.around.values else thermometer_words(state)
+    hint = '' if 'temperature' in state.around.values else way_of('temperature', state)
     fitted = yield from _compute(session, use.refine, hint=hint, own=state.own)
     guide, planned = session.sensor.guide, fitted.refinement.plan.poses
     session.change_sensor(guide=replace(guide, planned=planned or None, begun=guide.poses))
@@ -173,7 +174,8 @@ def _compute(session: Holder, function: Callable[..., Fitted], **given: Any) -> 
         refusal = refinement.refusal
     if refusal:
         why, advice = refusal
-        session.refuse('poses', advice)
+        is_asked = refinement is None and rating.next.kind == 'poses'  # the step names the pose
+        session.refuse('poses', why if is_asked else advice)
         if refinement is not None:
             rate(session, refinement)
         raise RefusedFitError(f'{found.words}; not used: {why}', advice)
@@ -282,8 +284,7 @@ def _rest(state: State) -> Dwell:
     length = math.nan if state.units.is_native else statistics.length / state.units.per_g
     if abs(length - 1.0) > settings.still_norm_tolerance:
         raise InputError(f'|a| is {length:.3g} g, expected about 1 g at rest',
-                         'hold the sensor still; if it is still, restart the node with the '
-                         'right units')
+                         'hold the sensor still; if it is still, start again with the right units')
     if not live.still:
         raise InputError('the sensor is not still', f'hold it still for {settings.min_dwell:g} s, '
                          'and check ~/still')
@@ -314,7 +315,8 @@ def load(session: Holder) -> Task:
     calibration = yield from _alone(session, Parse(store.load_calibration))
     if calibration is None:
         raise StoredCalibrationError(f'{store.calibration} does not exist',
-                                     'call ~/fit, or copy a calibration there')
+                                     'capture poses and call ~/fit, or copy a calibration '
+                                     'there')
     adopt(session, calibration)
     return f'read {store.calibration}'
 
@@ -342,7 +344,7 @@ def reset(session: Holder) -> Task:
     kept = yield from _alone(session, Files(store.set_aside, Parse(store.is_good)))
     session.sensor.live.clear()
     adopt(session, None)
-    session.change_sensor(fitted_poses=0)
+    session.change_sensor(fitted_poses=0, guide=Guide())
     poses_changed(session, ended=False)
     return 'poses and calibration are removed' + ''.join(
         f'; the stored file is kept as {path.name}' for path in kept)

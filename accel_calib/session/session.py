@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from .commands import fit_if_due, poses_changed
-from .conditions import APART, CONCERNS, conditions, next_step, slow_turn, thermometer_words
+from .conditions import APART, CONCERNS, conditions, next_step, slow_turn, way_of
 from .poses import Change
 from .settings import CalibratorSettings
 from .state import new_sensor
@@ -125,7 +125,7 @@ class Session(Holder):
             self.log('info', f'no pose yet: {turn}', 'slow_turn', AGAIN)
         if (state.surroundings.thermometers and statistics.messages
                 and 'temperature' not in topics and math.isnan(state.around.temperature)):
-            self.log('warning', f'no temperature arrives; {thermometer_words(state)}',
+            self.log('warning', f'no temperature arrives; {way_of("temperature", state)}',
                      'thermometers', 10.0 * _FAULT_AGAIN)
         for column in topics:
             lack, have = state.sensor.live.lacking(column)

@@ -39,7 +39,7 @@ from ..findings import mounting_words, Rating
 from ..messages import Known, OneReading, output_scale, Triple
 from ..refinement import Refinement
 from ..stillness import Dwell, overlap, rest_after
-from ..table import Floats
+from ..table import CONTEXT, Floats
 from ..units import FrameName, Units
 
 _SHORT_REST = 30.0
@@ -211,15 +211,15 @@ class Sensor:
         """Return the context of a rest, or None if the calibration needs more context."""
         if self.calibration is None:
             return None
-        context = self.context_of(rest, self.calibration)
-        known = all(key in context for key in self.calibration.model.needs)
-        return context if known else None
+        context, needs = self.context_of(rest, self.calibration), {*self.calibration.model.needs}
+        assumed = needs.intersection(CONTEXT) - rest.context.keys()
+        return context if needs <= context.keys() and not assumed else None
 
     def context_of(self, rest: Dwell, calibration: Calibration) -> Context:
-        """Return the context of a rest as one row, without a previous pose."""
-        neutral = {key: np.array([value]) for key, value in calibration.model.neutral.items()}
+        """Return the context of a rest as one row; what did not arrive is as for its messages."""
+        typical = {key: np.array([value]) for key, value in calibration.typical.items()}
         known = {key: np.array([value]) for key, value in rest.context.items()}
-        return {**neutral, 'previous': _NONE, 'rate': _NONE, **known,
+        return {**typical, 'previous': _NONE, 'rate': _NONE, **known,
                 'time': np.array([rest.time]), 'std': calibration.units.to_g(rest.std)[np.newaxis],
                 **self.temperatures.during(calibration.model, rest.start, rest.end)}
 
@@ -392,10 +392,11 @@ class State:
     def gravity(self) -> Floats | None:
         """Corrected force of the last rest, (3,) [m/s²]; None if it cannot be corrected."""
         rest, calibration = self.sensor.rest, self.sensor.calibration
-        context = None if rest is None else self.sensor.known_context(rest)
-        if rest is None or calibration is None or context is None:
+        if rest is None or calibration is None:
             return None
-        applied = self.on_topics(calibration)
+        context, applied = self.sensor.context_of(rest, calibration), self.on_topics(calibration)
+        if not {*calibration.model.needs} <= context.keys():
+            return None
         force = applied.correct(rest.mean[np.newaxis], context)[0]
         return force * output_scale(applied, self.settings.gravity)
 
