@@ -587,6 +587,9 @@ def test_a_start_without_a_column_leaves_it_in_the_stored_poses(
         assert np.sum(np.isnan(driver.poses[column])) == lack
         assert ('1 of 5 poses' in driver.logged('info')) is (k == 2 and bool(known))
         assert column not in driver.sensor.live.poses_for_fit(()) or not lack
+        fitted = driver.sensor.live.poses_for_fit((), [column])
+        assert (column in fitted, len(fitted)) == (True, len(driver.poses) - lack)
+        assert ('1 pose without' in ''.join(each.text for each in fitted.findings)) is bool(lack)
         driver.session.close()
         if k == 1:
             with open_log(driver.session.state.files.store.poses) as log:  # as a command reads it

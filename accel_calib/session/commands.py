@@ -156,7 +156,8 @@ def _compute(session: Holder, function: Callable[..., Fitted], **given: Any) -> 
     state, sensor, name = session.state, session.sensor, function.__name__
     session.change(computing=state.computing + 1)
     try:
-        poses = sensor.live.poses_for_fit(state.found)
+        poses = sensor.live.poses_for_fit(
+            state.found, () if sensor.present is None else sensor.present.model.needs)
         count = len(sensor.live.poses())
         found = yield Compute(function, poses, units=state.units, sensor=state.name,
                               before=sensor.present, **given)
