@@ -11,7 +11,7 @@ from typing import Any
 from accel_calib.errors import AccelCalibError
 from accel_calib.session import (
     answered, CalibratorSettings, columns_of, diagnostics, Log, next_step, progress, Result, run,
-    Session, ShowPoses, Task)
+    Session, Task)
 import numpy as np
 import pytest
 
@@ -28,7 +28,6 @@ class Driver:
         self.pace = 1.0  # of the stamps
         self.log: list[Log] = []
         self.results: list[str] = []
-        self.shown: ShowPoses | None = None
         self.session = Session(CalibratorSettings(**parameters), topic, lambda: self.now)
         self.handle()
 
@@ -41,8 +40,6 @@ class Driver:
                 self.log.append(event)
             elif isinstance(event, Result):
                 self.results.append(event.text)
-            elif isinstance(event, ShowPoses):
-                self.shown = event
 
     def end(self, answer: str) -> None:
         """Log the answer of a command that nobody asked for."""
@@ -50,7 +47,7 @@ class Driver:
 
     def done(self, task: Task) -> str:
         """Return the answer of a command."""
-        answer: str = answered(task)
+        answer: str = answered(task, self.handle)
         self.handle()
         return answer
 

@@ -303,6 +303,17 @@ def flat(folder: Path) -> Path:
     return path
 
 
+def test_the_limit_of_a_still_sensor_is_in_the_unit_of_the_readings(tmp_path: Path) -> None:
+    path, noise = tmp_path / 'g.csv', 0.015 * np.random.default_rng(3).normal(size=(2000, 3))
+    np.savetxt(path, np.column_stack([np.arange(2000) / 50.0, np.array([0.0, 0.0, 1.0]) + noise]),
+               delimiter=',', header='time,ax,ay,az', comments='')
+    with live(str(path), '-o', str(tmp_path / 'c.yaml'), '--units', 'g', '--speed', '5',
+              '--still-std-max', '0.04') as (link, _, _):
+        viewer = Viewer(link)
+        wait(lambda: viewer.of('progress') and viewer.of('progress')[-1]['poses'] == 1)
+        viewer.close()
+
+
 def test_only_its_owner_has_the_link_and_idle_connections_do_not_keep_it_out(
         tmp_path: Path) -> None:
     with (live(str(flat(tmp_path)), '-o', str(tmp_path / 'c.yaml')) as (link, lines, run),

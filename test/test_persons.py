@@ -125,9 +125,6 @@ def test_axes_of_a_driver_are_named_after_two_rests_and_poses_are_asked_for_as_t
         driver = Driver(sensor=words[4:9])
         person = Person(driver, reading(axes))
         person.follow(seconds=25.0)
-        assert driver.shown is not None
-        asked = next_step(driver.session.state).direction
-        np.testing.assert_allclose(driver.shown.asked.direction, asked)
         assert words in driver.logged('warning')
         lines = driver.logged('info').splitlines()
         missed = [line for line in lines if line.startswith('asked for ')]
@@ -203,6 +200,36 @@ def test_a_calibration_that_cannot_be_stored_leaves_no_file_and_is_asked_for_unt
     assert next_step(driver.session.state).kind == 'level'
 
 
+def test_an_assumed_temperature_is_that_of_messages_and_mounting_and_not_of_drift() -> None:
+    followed(warming, warms=1.2, sensor='arm')[0].session.close()
+    driver = Driver(sensor='arm')
+    feed = driver.feed
+    driver.feed = lambda readings, temperature: feed(readings)
+    person = Person(driver, warming)
+    person.rest([0.2, 0.1, 1.0], 12.0)
+    assert driver.sensor.drift.count == 0
+    assert 'no_value' in [each.kind for each in conditions(driver.session.state)]
+    driver.ask('set_level')
+    gravity = driver.session.state.gravity
+    reading = warming([0.2, 0.1, 1.0], 25.0) * GRAVITY
+    force = driver.sensor.force_of(tuple(reading), driver.session.state.context)
+    np.testing.assert_allclose(gravity / GRAVITY, force, atol=1e-3)
+    np.testing.assert_allclose(gravity[:2], 0.0, atol=1e-2)
+
+
+def test_where_no_ros_runs_options_are_named_instead_of_parameters() -> None:
+    for scale, words in ((1.0 / GRAVITY, '--units g'), (1.0, '--still-std-max 0.')):
+        driver = Driver()
+        driver.session.change(surroundings=Surroundings(publishers=None))
+        person = Person(driver, reading(scale=scale), shaken=0.04 * scale)
+        person.rest(person.flat)
+        person.steps.append('')
+        person.rest(person.flat, 12.0)
+        text = next_step(driver.session.state).text
+        assert f'start again with {words}' in text
+        driver.session.close()
+
+
 def test_no_step_is_named_while_the_rating_is_being_computed() -> None:
     driver = Driver(sensor='rated')
     person = Person(driver, reading())
@@ -215,6 +242,63 @@ def test_no_step_is_named_while_the_rating_is_being_computed() -> None:
     action = next_step(driver.session.state)
     assert (action.kind, action.text) == ('', '')
     assert not [line.words for line in driver.log[lines:] if 'next: ' in line.words]
+
+
+def test_only_a_rest_after_a_request_is_compared_with_it() -> None:
+    driver = Driver(confirm=True)
+    person = Person(driver, reading())
+    for up in (*np.eye(3), *-np.eye(3)):
+        person.rest(up)
+    driver.ask('fit')
+    lines, missed = len(driver.log), driver.sensor.guide.missed
+    for up in spread_directions(10):
+        person.rest(up)
+    assert next_step(driver.session.state).kind == 'accept'
+    driver.ask('save')
+    assert dict(health_figures(driver.session.state))['rating'].startswith('USABLE: nothing')
+    driver.ask('fit')
+    driver.ask('save')
+    assert next_step(driver.session.state).kind == 'level'
+    person.rest(person.flat)
+    assert driver.sensor.guide.missed == missed
+    assert not [line.words for line in driver.log[lines:] if 'asked for' in line.words]
+
+
+def test_a_step_offers_no_fit_of_the_same_poses_and_names_a_pose_after_each_refusal() -> None:
+    driver = Driver()
+    person = Person(driver, lambda up, warm: healthy(up, warm) + 0.01 * np.asarray(up)[[1, 2, 1]])
+    for up in [*np.eye(3), *-np.eye(3), [0.6, 0.8, 0.0], [0.0, -0.6, 0.8]]:
+        person.rest(up)
+    for command in ('fit', 'refine'):
+        driver.refuses('not used', command)
+        step = next_step(driver.session.state)
+        assert (step.kind, len(step.direction)) == ('poses', 3)
+        assert '~/fit' not in step.text
+    person.rest([0.8, 0.0, 0.6])
+    driver.ask('fit')
+    assert driver.sensor.rating.name == 'USABLE'
+    assert next_step(driver.session.state).command != 'fit'
+    for up in spread_directions(5):  # in an own order
+        person.rest(up)
+    assert driver.sensor.guide.missed >= 3
+    assert next_step(driver.session.state).text.count('~/fit') == 1
+
+
+def test_a_sensor_at_rest_does_not_turn_and_a_quick_turn_does_not_remove_gravity() -> None:
+    driver, rng = Driver(), np.random.default_rng(4)
+
+    def feed(up: Any) -> None:
+        driver.feed(GRAVITY * (np.array(up) + 0.01 * rng.normal(size=(len(up), 3))))
+        driver.tick()
+        assert conditions(driver.session.state)[0].step in ('', 'poses')
+        assert 'turning' not in next_step(driver.session.state).text
+
+    for seconds in (0.4, 0.8, 0.3, 0.9):
+        feed([[0.0, 0.0, 1.0]] * 200)
+        driver.stamp += seconds
+        feed([[0.0, 0.0, 1.0]] * 20)
+    angle = np.linspace(0.0, np.pi, 15)
+    feed(np.column_stack([np.sin(angle), 0.0 * angle, np.cos(angle)]))
 
 
 def test_words_and_direction_come_from_one_pose() -> None:

@@ -218,6 +218,18 @@ def test_a_fit_waits_for_confirmation_on_the_preview(bench: Any, readings: Readi
         force_of(bench.came_out[-1]) - [0.3, 0.4, 9.7]) > 0.05)
 
 
+def test_a_preview_is_in_the_frame_of_the_messages(
+        bench: Any, stored: Stored, readings: Readings) -> None:
+    preview = bench.listen(Imu, 'calibrator/preview')
+    bench.calibrator(calibration_file=stored(flat=[0.4, 0.0, 0.9]), confirm=True, rotate=False)
+    bench.feed(readings(spread_directions(12)))
+    assert bench.call('fit').success
+    offered, used = (bench.exchange(heard, lambda: bench.imu([0.3, 0.4, 9.7]))
+                     for heard in (preview, bench.came_out))
+    assert offered.header.frame_id == used.header.frame_id == 'imu_link'
+    np.testing.assert_allclose(force_of(offered), force_of(used), atol=0.5)
+
+
 # Start and end
 
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from accel_calib.calibration import plan_session
 from accel_calib.errors import InputError, RefusedFitError
+from accel_calib.finding import NextStep
 from accel_calib.findings import request_words
 from accel_calib.logs import read_poses, write_table
 from accel_calib.session import CalibratorSettings, Files, Log, nothing, Session, Task
@@ -46,12 +47,12 @@ def test_log_and_markers_report_that_more_poses_no_longer_help() -> None:
     poses = simulate_poses(Model({}), spread_directions(24), np.random.default_rng(1))
     asked = plan_session(poses, G, 'auto').asked
     assert (asked.direction, re.findall(r'\d\S*', request_words(asked))) == (None, ['24', '0.18'])
-    markers = pose_markers(np.zeros((0, 3)), asked, 'imu').markers
-    assert [m.text for m in markers if m.ns == 'next'] == [request_words(asked)]
-    few = plan_session(poses.take(slice(0, 8)), G, 'auto').asked
-    arrow, text = [m for m in pose_markers(np.zeros((0, 3)), few, 'imu').markers if m.ns == 'next']
-    np.testing.assert_allclose([getattr(arrow.points[1], axis) for axis in 'xyz'], few.direction)
-    assert text.text == request_words(few)
+    text, = [m.text for m in pose_markers(np.zeros((0, 3)), NextStep('done', 'x'), 'imu').markers
+             if m.ns == 'next']
+    few = NextStep('poses', 'turn', direction=(0.6, 0.0, 0.8))
+    arrow, turn = [m for m in pose_markers(np.zeros((0, 3)), few, 'imu').markers if m.ns == 'next']
+    assert tuple(getattr(arrow.points[1], axis) for axis in 'xyz') == few.direction
+    assert (text, turn.text) == ('x', 'turn')
 
 
 def test_poses_are_captured_and_removed_on_request(bench: Any, readings: Readings) -> None:
@@ -65,11 +66,10 @@ def test_poses_are_captured_and_removed_on_request(bench: Any, readings: Reading
     assert count(markers) == 0
     answer = bench.call_while('capture_pose', lambda: bench.imu(poses[130]))
     assert answer.success, answer.message
-    bench.spin(lambda: count(markers) == 1)
-    asked = markers[-1].markers[-1].text
+    asked = answer.message.partition('; next: ')[2]
     assert re.search(r' up \([-+xyz ]+\)$', asked)
-    assert answer.message.endswith(f'; next: {asked}')
-
+    bench.spin(lambda: count(markers) == 1)
+    assert asked in [each.markers[-1].text for each in markers]
     bench.send_until(lambda: bench.imu(poses[130]), lambda: diagnostics and any(
         value.key == 'next' and value.value == asked
         for value in diagnostics[-1].status[0].values))
@@ -101,6 +101,7 @@ def test_poses_are_drawn_for_a_listener_who_comes_later(bench: Any, readings: Re
     bench.spin(lambda: len(diagnostics) > known + 2)  # nothing more is to be drawn
     markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
     bench.spin(lambda: count(markers) == 2)
+    bench.spin(lambda: 'no Imu messages' in markers[-1].markers[-1].text)  # the next step
 
 
 def test_self_test_names_what_fails(bench: Any, stored: Stored) -> None:

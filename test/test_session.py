@@ -14,7 +14,7 @@ from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.finding import Finding, has, LEVELS
 from accel_calib.logs import open_log, read_poses, write_table
 from accel_calib.session import (
-    CalibratorSettings, changed, enable, next_step, progress, Surroundings)
+    CalibratorSettings, changed, enable, Mounting, next_step, progress, Surroundings)
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Poses
 from driven import Driver, RATE
@@ -375,6 +375,20 @@ def test_settings_that_contradict_each_other_are_refused(settings: Any, words: s
         Driver(**settings)
 
 
+def test_a_frame_that_is_renamed_while_the_node_runs_is_checked_and_shown(stored: Stored) -> None:
+    driver = Driver(calibration_file=str(stored(flat=UP)), publish_tf=True, base_frame='base')
+    driver.feed(np.full((5, 3), GRAVITY))
+    session = driver.session
+    for name, value, warned in (('rotate', False, 0), ('output_frame_id', 'imu_link', 0),
+                                ('rotate', True, 1), ('output_frame_id', 'level', 1)):
+        session.set_settings(changed(session.state.settings, {name: value}))
+        assert len([each for each in session.events if isinstance(each, Mounting)]) == 1
+        driver.handle()
+        assert driver.logged('warning').count('the frame of the sensor') == warned
+    with pytest.raises(InputError, match='a child of the frame of the sensor'):
+        changed(session.state.settings, {'output_frame_id': 'base'})
+
+
 # Steps back
 
 
@@ -449,6 +463,11 @@ def put(driver: Driver, readings: Readings, up: Any) -> None:
     driver.feed(readings([MOUNTING @ up], dwell=6.0)[:200])
 
 
+def applied(driver: Driver) -> Any:
+    """Return the rotation of messages."""
+    return driver.session.state.on_topics(driver.calibration).rotation
+
+
 def test_the_heading_needs_a_level_mounting_and_the_nose_down(
         stored: Stored, readings: Readings) -> None:
     driver = Driver(calibration_file=str(stored()))
@@ -458,7 +477,7 @@ def test_the_heading_needs_a_level_mounting_and_the_nose_down(
     driver.refuses('within 10° of the flat pose', 'set_heading')
     put(driver, readings, NOSE_DOWN)
     driver.ask('set_heading')
-    np.testing.assert_allclose(driver.session.state.applied.rotation, MOUNTING, atol=0.01)
+    np.testing.assert_allclose(applied(driver), MOUNTING, atol=0.01)
 
 
 @pytest.mark.parametrize(('frame', 'axes'), [
@@ -476,13 +495,13 @@ def test_messages_are_specific_force_in_every_frame_also_after_a_restart_with_an
     for after in ('ros', frame):
         driver = Driver(calibration_file=str(path), frame=after)
         expected = MOUNTING @ (np.eye(3) if after == 'ros' else axes)
-        np.testing.assert_allclose(driver.session.state.applied.rotation, expected, atol=0.01)
+        np.testing.assert_allclose(applied(driver), expected, atol=0.01)
         put(driver, readings, UP)
         gravity = driver.session.state.gravity / GRAVITY
         np.testing.assert_allclose(gravity, np.array(expected).T @ MOUNTING @ UP, atol=0.01)
         assert gravity[2] * (-1.0 if after == 'ned' else 1.0) > 0.99
         driver.ask('set_level')
-        np.testing.assert_allclose(driver.session.state.applied.rotation, expected, atol=0.01)
+        np.testing.assert_allclose(applied(driver), expected, atol=0.01)
         assert ('it is turned' in driver.logged('warning')) is (frame == 'android')
         driver.session.close()
 
@@ -495,8 +514,7 @@ def test_a_stored_mounting_of_the_documents_is_turned_before_it_is_used(
     flat, nose_down = found.predict(np.array([UP, NOSE_DOWN]) @ MOUNTING.T * GRAVITY)
     write_calibration(path, set_heading(level(found, flat, frame), nose_down))
     driver = Driver(calibration_file=str(path), frame='ned')
-    np.testing.assert_allclose(driver.session.state.applied.rotation,
-                               MOUNTING @ np.diag([1.0, -1.0, -1.0]), atol=1e-6)
+    np.testing.assert_allclose(applied(driver), MOUNTING @ np.diag([1.0, -1.0, -1.0]), atol=1e-6)
     assert f'frame {frame},' in driver.logged('warning')
 
 
@@ -571,6 +589,9 @@ def test_a_start_without_a_column_leaves_it_in_the_stored_poses(
         assert np.sum(np.isnan(driver.poses[column])) == lack
         assert ('1 of 5 poses' in driver.logged('info')) is (k == 2 and bool(known))
         assert column not in driver.sensor.live.poses_for_fit(()) or not lack
+        fitted = driver.sensor.live.poses_for_fit((), [column])
+        assert (column in fitted, len(fitted)) == (True, len(driver.poses) - lack)
+        assert ('1 pose without' in ''.join(each.text for each in fitted.findings)) is bool(lack)
         driver.session.close()
         if k == 1:
             with open_log(driver.session.state.files.store.poses) as log:  # as a command reads it

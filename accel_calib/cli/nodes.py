@@ -83,10 +83,12 @@ def run_live(args: argparse.Namespace) -> Done:
             output.print(f'read as: {source.read_as}')
         for each in source.findings:
             output.print(f'note: {each.words}')
+        capture = given(CaptureSettings, args)
+        if 'still_std_max' in capture and not source.units.is_native:  # the parameter is in m/s²
+            capture['still_std_max'] *= args.gravity / source.units.per_g
         host = Host(source, CalibratorSettings(
             units=source.units.name, gravity=args.gravity, calibration_file=str(args.output),
-            web_host=args.host, web_port=args.port, also=str(args.also or ''),
-            **given(CaptureSettings, args)),
+            web_host=args.host, web_port=args.port, also=str(args.also or ''), **capture),
             lambda line: output.print(line.words))
         try:
             print(host.server.announce(), flush=True)  # a file name is not wrapped

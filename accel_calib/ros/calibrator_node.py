@@ -41,16 +41,15 @@ from .declare import (
     CALLS, declared, follow, LATCHED, mismatches, name_of, needs_tf2, published_by_others, SENSOR,
     static_transform, STREAM, TOPIC, watch_static)
 from .stream import ContextTopics, Stream
-from ..calibration import NextPose
 from ..errors import AccelCalibError
-from ..finding import LEVELS
-from ..findings import request_words
+from ..finding import LEVELS, NextStep
 from ..live import check_installed
 from ..logs import named_topics
 from ..messages import output_frame
 from ..session import (
     CalibratorSettings, CallSoon, Check, COMMANDS, conditions, diagnostics, enable, Event, figures,
-    Log, Mounting, progress, Result, run, Session, ShowPoses, Still, Surroundings, Task, Worker)
+    Log, Mounting, next_step, progress, Result, run, Session, ShowPoses, Still, Surroundings, Task,
+    Worker)
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -67,13 +66,13 @@ _ASKED_FOR = (1.0, 0.6, 0.0, 1.0)
 _WORDS = (1.0, 1.0, 1.0, 1.0)
 _SPHERE = (0.6, 0.6, 0.7, 0.15)
 _NUMBER_AT, _WORDS_AT = 1.12, 1.35
-_CENTRE, _ABOVE = np.zeros(3), np.array([0.0, 0.0, 1.0])
+_CENTRE, _ABOVE = np.zeros(3), (0.0, 0.0, 1.0)
 _DOT, _LETTER, _SHAFT = 0.1, 0.1, 0.04
 
 
-def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerArray:
+def pose_markers(directions: Floats, step: NextStep, frame_id: str) -> MarkerArray:
     """
-    Return markers of the captured poses and of the next pose; they replace all earlier markers.
+    Return markers of the captured poses and of the next step; they replace all earlier markers.
 
     The (n, 3) directions of up are unit vectors in the sensor axes.
 
@@ -83,14 +82,14 @@ def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerAr
         markers += [_marker('poses', k, _CAPTURED, _DOT, direction),
                     _marker('numbers', k, _WORDS, _LETTER, direction * _NUMBER_AT,
                             text=str(k + 1))]
-    up = _ABOVE if asked.direction is None else asked.direction
-    if asked.direction is not None:
+    up = np.array(step.direction or _ABOVE)
+    if step.direction:
         arrow = _marker('next', 0, _ASKED_FOR, _SHAFT)
         arrow.type, arrow.scale.y, arrow.scale.z = Marker.ARROW, 2.0 * _SHAFT, 2.0 * _SHAFT
         arrow.points = [Point(), Point(**dict(zip('xyz', up.tolist())))]
         markers.append(arrow)
     markers.append(_marker('next', 1, _WORDS, _LETTER, up * _WORDS_AT,
-                           text=request_words(asked)))
+                           text=step.text))
     for marker in markers:
         marker.header.frame_id = frame_id
     return MarkerArray(markers=markers)
@@ -133,7 +132,8 @@ class Calibrator:
         self._worker = Worker(self.session.events, self._call_soon, self._show,
                               lambda: self.stream.flush())
         self._progress_at = 0.0
-        self._unseen: ShowPoses | None = None  # poses whose markers nobody has received
+        self._shown: ShowPoses | None = None
+        self._drawn: NextStep | None = None  # that of the last markers of these poses
         self._still = node.create_publisher(Bool, '~/still', LATCHED)
         self._poses = node.create_publisher(MarkerArray, '~/poses', LATCHED)
         self._progress = node.create_publisher(DiagnosticStatus, '~/progress', LATCHED)
@@ -241,11 +241,11 @@ class Calibrator:
             Check('progress', first.text, first.level), progress(now).figures()))
 
     def _show_poses(self) -> None:
-        """Publish the markers of the poses if somebody listens: to make them takes 5 ms."""
-        new = self._unseen
-        if new is not None and self._poses.get_subscription_count():
-            self._poses.publish(pose_markers(new.up, new.asked, new.frame_id))
-            self._unseen = None
+        """Publish new markers if somebody listens: to make them takes 5 ms."""
+        poses, step = self._shown, next_step(self.session.state)
+        if poses is not None and step != self._drawn and self._poses.get_subscription_count():
+            self._poses.publish(pose_markers(poses.up, step, poses.frame_id))
+            self._drawn = step
 
     def _show(self, event: Event) -> None:
         if self._page is not None:
@@ -261,7 +261,7 @@ class Calibrator:
             case Still(still):
                 self._still.publish(Bool(data=still))
             case ShowPoses():
-                self._unseen = event
+                self._shown, self._drawn = event, None
                 self._show_poses()
                 self._show_progress()
             case Result(text):

@@ -31,7 +31,6 @@ from rclpy.validate_topic_name import validate_topic_name
 from sensor_msgs.msg import Imu
 
 from .declare import published_by_others, SENSOR
-from ..calibration import on_topics
 from ..errors import AccelCalibError, InputError
 from ..logs import (
     ACCELERATION, field_of, IMU_DOUBLES, joined, Layout, layout_of, LITTLE_ENDIAN, NAME_AT,
@@ -220,8 +219,7 @@ class Stream:
             output.listeners = output.publisher.get_subscription_count()
             made_for = layout, calibration, settings, noise is None
             if not all(map(operator.is_, made_for, output.made_for)):
-                turned = state.applied if output is self._calibrated else (
-                    calibration and on_topics(calibration, settings.frame))
+                turned = calibration and state.on_topics(calibration)
                 output.made_for, output.rewriter = made_for, None if turned is None else Rewriter(
                     layout, turned, settings.gravity, output_frame(
                         turned, layout.frame_id, settings.output_frame_id), noise=noise,

@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 
 from . import use
-from .conditions import next_words, thermometer_words, words_of_state
+from .conditions import next_words, way_of, words_of_state
+from .poses import Guide
 from .state import Sensor, State
 from .store import writing_advice
 from .use import adopt, Fitted, Holder, rate, show_poses
 from .worker import Compute, Files, nothing, Parse, Part, Task
 from ..calibration import (
-    Calibration, fit_partial, gyro_bias_of_rest, level, mounting_only, plan_session,
-    set_heading as with_heading)
+    Calibration, fit_partial, gyro_bias_of_rest, level, mounting_only, set_heading as with_heading)
 from ..effects import Model
 from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
 from ..findings import angle_words, difference_words
@@ -75,9 +75,7 @@ def capture_pose(session: Holder) -> Task:
     if session.state.computing:
         yield Files(nothing)
         return f'{words}; the next pose is on ~/poses after the computation that is running'
-    plan = yield Compute(plan_session, poses, session.state.units, session.state.settings.model)
-    if session.sensor.live is sensor.live:
-        session.change_sensor(guide=session.sensor.guide.choose(plan))
+    yield Compute(nothing)  # until the next pose is chosen
     return f'{words}{next_words(session.state)}'
 
 
@@ -143,7 +141,7 @@ def fit(session: Holder) -> Part[Fitted]:
 def refine(session: Holder) -> Part[Fitted]:
     """Refine the calibration."""
     state = session.state
-    hint = '' if 'temperature' in state.around.values else thermometer_words(state)
+    hint = '' if 'temperature' in state.around.values else way_of('temperature', state)
     fitted = yield from _compute(session, use.refine, hint=hint, own=state.own)
     guide, planned = session.sensor.guide, fitted.refinement.plan.poses
     session.change_sensor(guide=replace(guide, planned=planned or None, begun=guide.poses))
@@ -156,7 +154,8 @@ def _compute(session: Holder, function: Callable[..., Fitted], **given: Any) -> 
     state, sensor, name = session.state, session.sensor, function.__name__
     session.change(computing=state.computing + 1)
     try:
-        poses = sensor.live.poses_for_fit(state.found)
+        poses = sensor.live.poses_for_fit(
+            state.found, () if sensor.present is None else sensor.present.model.needs)
         count = len(sensor.live.poses())
         found = yield Compute(function, poses, units=state.units, sensor=state.name,
                               before=sensor.present, **given)
@@ -174,7 +173,8 @@ def _compute(session: Holder, function: Callable[..., Fitted], **given: Any) -> 
         refusal = refinement.refusal
     if refusal:
         why, advice = refusal
-        session.refuse('poses', advice)
+        is_asked = refinement is None and rating.next.kind == 'poses'  # the step names the pose
+        session.refuse('poses', why if is_asked else advice)
         if refinement is not None:
             rate(session, refinement)
         raise RefusedFitError(f'{found.words}; not used: {why}', advice)
@@ -283,8 +283,7 @@ def _rest(state: State) -> Dwell:
     length = math.nan if state.units.is_native else statistics.length / state.units.per_g
     if abs(length - 1.0) > settings.still_norm_tolerance:
         raise InputError(f'|a| is {length:.3g} g, expected about 1 g at rest',
-                         'hold the sensor still; if it is still, restart the node with the '
-                         'right units')
+                         'hold the sensor still; if it is still, start again with the right units')
     if not live.still:
         raise InputError('the sensor is not still', f'hold it still for {settings.min_dwell:g} s, '
                          'and check ~/still')
@@ -315,7 +314,8 @@ def load(session: Holder) -> Task:
     calibration = yield from _alone(session, Parse(store.load_calibration))
     if calibration is None:
         raise StoredCalibrationError(f'{store.calibration} does not exist',
-                                     'call ~/fit, or copy a calibration there')
+                                     'capture poses and call ~/fit, or copy a calibration '
+                                     'there')
     adopt(session, calibration)
     return f'read {store.calibration}'
 
@@ -345,7 +345,7 @@ def reset(session: Holder) -> Task:
     kept = yield from _alone(session, Files(store.set_aside, Parse(store.is_good)))
     session.sensor.live.clear()
     adopt(session, None)
-    session.change_sensor(fitted_poses=0)
+    session.change_sensor(fitted_poses=0, guide=Guide())
     poses_changed(session, ended=False)
     return 'poses and calibration are removed' + ''.join(
         f'; the stored file is kept as {path.name}' for path in kept)

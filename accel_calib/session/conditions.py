@@ -25,6 +25,7 @@ import numpy as np
 
 from .poses import Guide
 from .state import State, title
+from .store import ANOTHER_FILE
 from .stream import SILENT
 from ..comparison import status
 from ..errors import InputError
@@ -85,7 +86,7 @@ def conditions(state: State) -> list[Finding]:
     if store is not None and not store.is_writable():
         files.append(Finding(
             'read_only', f'{state.files.path} cannot be written: correct the permissions, or '
-            'restart the node with another calibration_file', level='BAD'))
+            f'{ANOTHER_FILE}', level='BAD'))
     blocks = bool(state.files.problem) or state.is_refused
     first, files = (files[:1], files[1:]) if blocks else ([], files)
     ended = state.surroundings.ended
@@ -129,13 +130,16 @@ def _feasible_step(state: State) -> Finding:
         is_missed = guide.missed >= _NOT_FOLLOWED
         is_stuck = (is_refused or is_missed
                     or state.statistics.stamp - guide.new_at >= _WITHOUT_NEW)
-        if is_stuck and present is not None and (is_partial(present) or is_missed):
+        can_fit = step.command == 'fit' and not refusal
+        if is_stuck and present is not None and not can_fit and (
+                is_partial(present) or is_missed):
             step = _LEVEL if not present.is_levelled else _step(
                 'done', f'use the calibration in these orientations; for others: {step.text}')
         elif is_stuck and present is None and not is_refused and (
                 guide.poses >= FEWEST_IN_CONE and not state.refusal_of('fit')):
-            step = replace(step, text=f'{step.text}; if it cannot be turned further, call ~/fit',
-                           command='fit')
+            step = step if can_fit else replace(
+                step, text=f'{step.text}; if it cannot be turned further, call ~/fit',
+                command='fit')
         elif is_stuck and present is None and not state.refusal_of('calibrate_at_rest'):
             step = replace(step, text=f'{step.text}; if it cannot be turned over, place the robot '
                            'level, hold it still and call ~/calibrate_at_rest',
@@ -168,9 +172,11 @@ def _ordinary_step(state: State) -> Finding:
     if rating is not None and rating.findings and rating.findings[0].kind == 'flat_pose':
         return _step('level', f'{rating.reason}; if it is mounted so, place it level again '
                      'and call ~/set_level once more', 'set_level')
-    if refusal := state.refusal_of('poses'):
-        return _step('poses', refusal)
-    asked, is_fitted = step_of(guide), 0 < guide.poses == sensor.fitted_poses  # to all poses
+    is_fitted, refusal = 0 < guide.count == sensor.fitted_poses, state.refusal_of('poses')
+    asked = step_of(guide, may_fit=not is_fitted and not refusal)  # a fit would give the same
+    if refusal:
+        text = f'{refusal}; {asked.text}' if asked.direction else refusal
+        return _step('poses', text, direction=asked.direction)
     if rating is None or not is_fitted or guide.planned is not None:
         return asked
     if rating.next.kind == 'poses' and asked.direction:
@@ -178,7 +184,7 @@ def _ordinary_step(state: State) -> Finding:
     return _calling(rating.next.kind, rating.next.text)
 
 
-def step_of(guide: Guide) -> Finding:
+def step_of(guide: Guide, *, may_fit: bool = True) -> Finding:
     """Return what to do next with the poses; without a kind before the first choice."""
     plan = guide.plan
     if guide.planned == ():
@@ -189,8 +195,9 @@ def step_of(guide: Guide) -> Finding:
     words = request_words(asked)
     if asked.direction is None:
         return _calling('fit', words)
-    return _step('poses', f'{words}, or call ~/fit' if asked.fits else words,
-                 'fit' if asked.fits else '', direction=tuple(asked.direction.tolist()))
+    fits = asked.fits and may_fit
+    return _step('poses', f'{words}, or call ~/fit' if fits else words, 'fit' if fits else '',
+                 direction=tuple(asked.direction.tolist()))
 
 
 def slow_turn(state: State) -> str:
@@ -218,16 +225,12 @@ def _check_use(state: State) -> Iterator[Finding]:
 
 def _check_context(state: State) -> Iterator[Finding]:
     """Yield the columns of the context that are missing, why, and what follows."""
-    calibration, around, outside = state.sensor.calibration, state.around, state.surroundings
+    calibration, around = state.sensor.calibration, state.around
     needs = () if calibration is None else calibration.model.needs
     wanted = [*named_topics(state.settings.context), *(
         key for key in needs if key in CONTEXT or is_quantity(key))]
     for column in filter(around.is_missing, dict.fromkeys(wanted)):
-        why = outside.missing.get(column) or (
-            'the samples do not have it' if outside.publishers is None else
-            thermometer_words(state) if column == 'temperature' else
-            f"start the node with context:=['{column}:=TOPIC'], and its topic")
-        follows = ''
+        follows, why = '', way_of(column, state)
         if column in around.values:
             follows = '; the last value holds'
         elif column in needs:
@@ -237,13 +240,24 @@ def _check_context(state: State) -> Iterator[Finding]:
                       about=column)
 
 
-def thermometer_words(state: State) -> str:
-    """Return how the node would get a temperature."""
+def way_of(column: str, state: State) -> str:
+    """Return how a column of the context would arrive, or why it does not."""
     around = state.surroundings
+    if around.publishers is None:
+        return f'the samples have no {column}'
+    if column != 'temperature' or column in around.missing:
+        return around.missing.get(
+            column, f"start the node with context:=['{column}:=TOPIC'], and its topic")
     topics = ' or '.join(around.thermometers)
-    return around.missing.get('temperature') or (
-        f'restart the node with temperature:={topics}' if topics else
-        'publish the temperature of the sensor on the topic temperature')
+    return (f'restart the node with temperature:={topics}' if topics else
+            'publish the temperature of the sensor on the topic temperature')
+
+
+def _restart(state: State, parameter: str, value: str) -> str:
+    """Return how to start again with a parameter: of the node, or as an option."""
+    if state.surroundings.publishers is None:
+        return f'start again with --{parameter.replace("_", "-")} {value}'
+    return f'restart the node with {parameter}:={value}'
 
 
 _LASTS = 5.0
@@ -293,18 +307,19 @@ def _check_stream(state: State) -> list[Finding]:
         found['unit'] = f'|a| is {length:.3g} g, expected about 1 g at rest: ' + (
             'this is linear acceleration, gravity removed: let the driver publish what the '
             'accelerometer reads' if length < _WITHOUT_GRAVITY_G else
-            f'start the node with units:={likely}')
+            _restart(state, 'units', likely))
     if statistics.dropped_ago < _LASTS:
         found |= {kind: f'dropped {counted(statistics.dropped[kind], what)} {why}'
                   for kind, (what, why) in _DROPPED.items() if statistics.dropped[kind]}
     limit, spread = live.detector.threshold, statistics.shaken(units.per_g)
     if math.isfinite(limit) and spread > limit and not (
             is_wrong or live.still or units.is_native):  # stays in one direction, but no rest
+        per_g = units.per_g if names is None else state.settings.gravity  # of the option
         found['vibration'] = (
             f'no rest: the readings vary by {spread / units.per_g * MG:.1f} mg, a rest by at most '
             f'{limit / units.per_g * MG:.1f} mg: rest the sensor on something and stop what '
-            'vibrates; if it always does, restart the node with still_std_max:='
-            f'{1.5 * spread / units.per_g * state.settings.gravity:.2g}')
+            'vibrates; if it always does, '
+            + _restart(state, 'still_std_max', f'{1.5 * spread / units.per_g * per_g:.2g}'))
     return [Finding(kind, text, level='USABLE') for kind, text in found.items() if text]
 
 
@@ -497,6 +512,8 @@ def figures(state: State) -> Iterator[tuple[str, str]]:
     yield 'state', words_of_state(state)
     yield 'sensor', state.name
     yield 'calibration', 'none' if sensor.calibration is None else title(sensor.calibration)
+    rating = None if sensor.offered is not None else sensor.rating  # of that in use
+    yield 'rating', 'not known' if rating is None else f'{rating.name}: {rating.reason}'
     yield 'calibration file', state.files.path
     yield 'rate [Hz]', f'{counts.rate:.1f}'
     yield 'messages', str(counts.messages)
@@ -527,7 +544,7 @@ def figures(state: State) -> Iterator[tuple[str, str]]:
     yield 'zeros or frozen readings [s]', (
         f'{sum(each.end - each.start for each in live.detector.missing):.1f}')
     yield 'temperature [°C]', (_number(warm) if math.isfinite(warm)
-                               else f'not known: {thermometer_words(state)}')
+                               else f'not known: {way_of("temperature", state)}')
     for column in named_topics(state.settings.context):
         unit = column_of(column).unit
         if column != 'temperature':

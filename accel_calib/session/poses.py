@@ -40,6 +40,7 @@ from ..stillness import (
     account_of, CaptureSettings, check_measured, Dwell, dwells_of, overlap, poses_from, Rest,
     select, StillDetector, with_temperature)
 from ..table import CONTEXT, Floats, Poses
+from ..text import counted
 from ..units import MG, Units
 
 _SEPARATE = 64
@@ -187,12 +188,13 @@ class LiveCapture:
         self.put(rest, ended=False)
         self._declined = None
 
-    def poses_for_fit(self, found: tuple[Finding, ...]) -> Poses:
+    def poses_for_fit(self, found: tuple[Finding, ...], needs: Sequence[str] = ()) -> Poses:
         """
         Return the poses with findings about their samples: these, and those of the rests.
 
-        The provisional pose of the ongoing rest is updated. RefusedFitError if no sensor measures
-        so.
+        The provisional pose of the ongoing rest is updated. Poses without the columns that the
+        calibration `needs` are left out if others have them. RefusedFitError if no sensor
+        measures so.
 
         """
         ongoing = self.detector.current() if self._held else None
@@ -206,6 +208,12 @@ class LiveCapture:
         rests = [*(each.rest for each in judged), *self.detector.missing]
         own = [each for each in rests if each.start >= self._begun]
         poses = self.poses()
+        lack = np.any([np.isnan(poses[key]) for key in needs if key in poses] or [[False]], axis=0)
+        if np.any(lack) and not np.all(lack):
+            found = (*found, Finding(
+                'note', f'{counted(int(np.sum(lack)), "pose")} without '
+                f'{" or ".join(key for key in needs if key in poses)} left out'))
+            poses = poses.take(~lack)
         partial = [key for key in (*CONTEXT, *poses.quantities)
                    if key in poses and np.isnan(poses[key]).any()]
         return replace(poses.without_columns(*partial),

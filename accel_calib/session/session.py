@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from .commands import fit_if_due, poses_changed
-from .conditions import APART, CONCERNS, conditions, next_step, slow_turn, thermometer_words
+from .conditions import APART, CONCERNS, conditions, next_step, slow_turn, way_of
 from .poses import Change
 from .settings import CalibratorSettings
 from .state import new_sensor
@@ -87,6 +87,9 @@ class Session(Holder):
         if settings.model != before.model:
             self.change_sensor(guide=self.sensor.guide.choose(None))
             show_poses(self, store=False)
+        if (settings.output_frame_id, settings.rotate) != (
+                before.output_frame_id, before.rotate):
+            self._show_frame()
 
     def tick(self) -> None:
         """Check the stream, and try to lock the files; to be called about once per second."""
@@ -122,7 +125,7 @@ class Session(Holder):
             self.log('info', f'no pose yet: {turn}', 'slow_turn', AGAIN)
         if (state.surroundings.thermometers and statistics.messages
                 and 'temperature' not in topics and math.isnan(state.around.temperature)):
-            self.log('warning', f'no temperature arrives; {thermometer_words(state)}',
+            self.log('warning', f'no temperature arrives; {way_of("temperature", state)}',
                      'thermometers', 10.0 * _FAULT_AGAIN)
         for column in topics:
             lack, have = state.sensor.live.lacking(column)
@@ -244,16 +247,16 @@ class Session(Holder):
     # The sensor and its files
 
     def _show_frame(self) -> None:
-        """Show poses and mounting in the frame of the sensor, which was not known before."""
-        frame_id = self.state.frame_id
-        if frame_id and frame_id == self.state.settings.output_frame_id:
+        """Show poses and mounting in the frames, which have changed."""
+        frame_id, settings = self.state.frame_id, self.state.settings
+        if frame_id and settings.rotate and frame_id == settings.output_frame_id:
             self.log('warning', f'output_frame_id is {frame_id!r}, the frame of the sensor: TF '
                      'turns levelled messages twice; choose another output_frame_id, or set '
                      'rotate to false')
         show_mounting(self)
         plan = self.sensor.guide.plan
         if plan is not None:
-            self.events.append(ShowPoses(plan.up, plan.asked, frame_id or ''))
+            self.events.append(ShowPoses(plan.up, frame_id or ''))
 
     def _begin(self, run: Callable[[Task], object]) -> bool:
         """

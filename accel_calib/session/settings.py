@@ -212,6 +212,15 @@ class CalibratorSettings:
         '127.0.0.1', 'Address at which the live page is served. 0.0.0.0: to the whole network, '
         'without encryption')
 
+    def __post_init__(self) -> None:
+        if any(self.mounting_rpy) and self.base_frame:
+            raise InputError('both mounting_rpy and base_frame are set, expected one of them',
+                             'remove one')
+        if self.publish_tf and self.output_frame_id and self.output_frame_id == self.base_frame:
+            raise InputError(f'publish_tf would make {self.base_frame!r}, the frame of the '
+                             'robot, a child of the frame of the sensor',
+                             'set publish_tf to false, or choose another output_frame_id')
+
 
 def columns_of(settings: CalibratorSettings) -> tuple[str, ...]:
     """Return the columns of the context of a sample."""

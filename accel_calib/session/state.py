@@ -39,6 +39,7 @@ from ..findings import mounting_words, Rating
 from ..messages import Known, OneReading, output_scale, Triple
 from ..refinement import Refinement
 from ..stillness import Dwell, overlap, rest_after
+from ..table import CONTEXT
 from ..units import Floats, FrameName, Units
 
 _SHORT_REST = 30.0
@@ -210,15 +211,15 @@ class Sensor:
         """Return the context of a rest, or None if the calibration needs more context."""
         if self.calibration is None:
             return None
-        context = self.context_of(rest, self.calibration)
-        known = all(key in context for key in self.calibration.model.needs)
-        return context if known else None
+        context, needs = self.context_of(rest, self.calibration), {*self.calibration.model.needs}
+        assumed = needs.intersection(CONTEXT) - rest.context.keys()
+        return context if needs <= context.keys() and not assumed else None
 
     def context_of(self, rest: Dwell, calibration: Calibration) -> Context:
-        """Return the context of a rest as one row, without a previous pose."""
-        neutral = {key: np.array([value]) for key, value in calibration.model.neutral.items()}
+        """Return the context of a rest as one row; what did not arrive is as for its messages."""
+        typical = {key: np.array([value]) for key, value in calibration.typical.items()}
         known = {key: np.array([value]) for key, value in rest.context.items()}
-        return {**neutral, 'previous': _NONE, 'rate': _NONE, **known,
+        return {**typical, 'previous': _NONE, 'rate': _NONE, **known,
                 'time': np.array([rest.time]), 'std': calibration.units.to_g(rest.std)[np.newaxis],
                 **self.temperatures.during(calibration.model, rest.start, rest.end)}
 
@@ -382,20 +383,19 @@ class State:
         stamp = self.statistics.stamp
         return {**self.around.filled, **({} if math.isnan(stamp) else {'time': stamp})}
 
-    @cached_property
-    def applied(self) -> Calibration | None:
-        """Return the calibration in use in the frame of messages, or without the mounting."""
-        calibration = self.sensor.calibration
-        if calibration is None or not self.settings.rotate:
-            return calibration and calibration.in_sensor_frame
-        return on_topics(calibration, self.settings.frame)
+    def on_topics(self, calibration: Calibration) -> Calibration:
+        """Return a calibration in the frame of messages, or without the mounting."""
+        return (on_topics(calibration, self.settings.frame) if self.settings.rotate
+                else calibration.in_sensor_frame)
 
     @cached_property
     def gravity(self) -> Floats | None:
         """Corrected force of the last rest, (3,) [m/s²]; None if it cannot be corrected."""
-        rest, applied = self.sensor.rest, self.applied
-        context = None if rest is None else self.sensor.known_context(rest)
-        if rest is None or applied is None or context is None:
+        rest, calibration = self.sensor.rest, self.sensor.calibration
+        if rest is None or calibration is None:
+            return None
+        context, applied = self.sensor.context_of(rest, calibration), self.on_topics(calibration)
+        if not {*calibration.model.needs} <= context.keys():
             return None
         force = applied.correct(rest.mean[np.newaxis], context)[0]
         return force * output_scale(applied, self.settings.gravity)

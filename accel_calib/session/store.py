@@ -44,6 +44,9 @@ from ..table import LARGEST, Poses
 from ..text import LONGEST_NAME, one_line
 from ..units import UnitName
 
+ANOTHER_FILE = 'start again with another calibration_file (live: another -o)'
+"""What to do if a file cannot be used: the parameter of the node, and the option of ``live``."""
+
 _UNSAFE = re.compile(r'[^A-Za-z0-9_-]+')
 _UNSAFE_NAMED = re.compile(r'^\.+|[^A-Za-z0-9._-]+')
 _NAMELESS = 'imu'
@@ -116,7 +119,7 @@ class Store:
         except InputError as err:
             raise StoredCalibrationError(f'{path} is for readings in {calibration.units.name}, '
                                          f'but the parameter units is {self.units}',
-                                         'restart the node with units of the calibration'
+                                         'start again with the units of the calibration'
                                          ) from err
 
     def load_poses(self) -> Poses | None:
@@ -310,10 +313,10 @@ def writing_advice(error: OSError) -> str:
     """Return what to do about a file that cannot be written."""
     if is_full(error):
         return FREE_SPACE
-    another = 'restart the node with another calibration_file'
     if error.errno == errno.EROFS:
-        return 'mount the file system for writing, or restart the node with calibration_file'
-    return another if error.errno in _OTHER_PLACE else f'correct the permissions, or {another}'
+        return f'mount the file system for writing, or {ANOTHER_FILE}'
+    return ANOTHER_FILE if error.errno in _OTHER_PLACE else (
+        f'correct the permissions, or {ANOTHER_FILE}')
 
 
 _TO_LOCK = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
@@ -359,7 +362,7 @@ class SensorFiles:
                 holder = os.read(handle, 32).decode(errors='replace').strip() or 'unknown'
                 return replace(self, problem=str(InputError(
                     f'{path} is used by the node with process id {holder}', 'stop that node, or '
-                    'restart this node with another calibration_file or sensor')))
+                    f'{ANOTHER_FILE}, or another sensor')))
             except OSError:
                 return mine  # this file system has no locks
             with suppress(OSError):  # without space on the disk, the lock does not name its holder

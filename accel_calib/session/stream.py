@@ -29,7 +29,10 @@ _HELD = 3.0
 """Time without shaking after which a sensor that is not still is turning slowly [s]."""
 
 _TURNS = 0.1
-"""Slowest turn that is reported [°/s]; the noise of the readings looks like slower ones."""
+"""Slowest turn that is reported [°/s]."""
+
+_BEYOND_NOISE = 8.0
+"""Range of the means of batches that do not turn, at most, in their standard deviations."""
 
 SILENT = 2.0
 """Time without messages after which the stream counts as silent [s]."""
@@ -51,14 +54,16 @@ class _Batch(NamedTuple):
     """
     Messages that were added together.
 
-    `arrived` and `stamp` are those of the last one [s]; `mean` is the (3,) mean reading, and
-    `spread` the largest standard deviation over its axes. The others are numbers of messages.
+    `arrived` and `stamp` are those of the last one [s]; `mean` is the (3,) mean reading, `length`
+    the mean length of a reading, which a quick turn does not change, and `spread` the largest
+    standard deviation over the axes. The others are numbers of messages.
 
     """
 
     arrived: float
     stamp: float
     mean: Floats
+    length: float
     spread: float
     messages: int
     zero: int
@@ -100,7 +105,8 @@ class StreamStatistics:
         readings = rows[:, 1:4]
         self.spread = float(np.max(readings.std(axis=0)))
         self._batches.append(_Batch(
-            arrived, float(stamps[-1]), readings.mean(axis=0), self.spread, len(rows),
+            arrived, float(stamps[-1]), readings.mean(axis=0),
+            float(np.linalg.norm(readings, axis=1).mean()), self.spread, len(rows),
             *(int(np.sum(each)) for each in (stamps == 0.0, steps == 0.0, steps < 0.0))))
         while self._batches[0].arrived < arrived - _SPAN:
             self._batches.popleft()
@@ -115,10 +121,10 @@ class StreamStatistics:
         if not track or max(each.spread for each in track) >= threshold:
             return 0.0
         seconds = self.stamp - track[0].stamp
-        steps = np.diff([each.mean for each in track], axis=0)
-        way = float(np.sum(np.linalg.norm(steps, axis=1))) / expected
-        rate = math.degrees(way) / seconds if seconds > 0.8 * _HELD else 0.0
-        return rate if rate > _TURNS else 0.0
+        way = float(np.linalg.norm(np.ptp([each.mean for each in track], axis=0)))
+        noise = max(each.spread / math.sqrt(each.messages) for each in track)
+        rate = math.degrees(way / expected) / seconds if seconds > 0.8 * _HELD else 0.0
+        return rate if rate > _TURNS and way > _BEYOND_NOISE * noise else 0.0
 
     def shaken(self, per_g: float) -> float:
         """Return the smallest spread of the last batches in one direction; 0 if it has turned."""
@@ -161,15 +167,15 @@ class StreamStatistics:
 
     @property
     def length(self) -> float:
-        """Length of the mean reading of the last batch; NaN without messages."""
-        return float(np.linalg.norm(self._batches[-1].mean)) if self._batches else math.nan
+        """Mean length of a reading of the last batch; NaN without messages."""
+        return self._batches[-1].length if self._batches else math.nan
 
     @property
     def stamp_fault(self) -> str:
         """Return what is wrong with the stamps of the last seconds, and what to do, or ''."""
         if self.age > SILENT:
             return ''
-        messages, zero, repeated, backward = np.sum([each[4:] for each in self._batches], axis=0)
+        messages, zero, repeated, backward = np.sum([each[5:] for each in self._batches], axis=0)
         if messages < _FEWEST:
             return ''
         driver = 'expected the time of each reading: set header.stamp in the driver'

@@ -167,14 +167,6 @@ class Holder:
 
     def __init__(self, settings: CalibratorSettings, topic: str, clock: Callable[[], float],
                  **known: Any) -> None:
-        if any(settings.mounting_rpy) and settings.base_frame:
-            raise InputError('both mounting_rpy and base_frame are set, expected one of them',
-                             'remove one')
-        if settings.publish_tf and settings.output_frame_id and (
-                settings.output_frame_id == settings.base_frame):
-            raise InputError(f'publish_tf would make {settings.base_frame!r}, the frame of the '
-                             'robot, a child of the frame of the sensor',
-                             'set publish_tf to false, or choose another output_frame_id')
         try:
             own = effects_of_file(Path(settings.also).expanduser()) if settings.also else ()
         except (OSError, RuntimeError) as error:
@@ -302,7 +294,7 @@ def _draw_poses(session: Holder, sensor: Sensor, poses: Poses, *, added: int,
                 new_rest: Dwell | None, store: Store | None) -> Task:
     """Store and draw poses, this number more than before; return the line of a new rest."""
     state, guide, missed = session.state, session.sensor.guide, ''
-    if new_rest is not None and state.sensor.live is sensor.live:
+    if new_rest is not None and state.sensor.live is sensor.live and next_step(state).direction:
         guide, missed = guide.answer(new_rest.mean, state.units)
         session.change_sensor(guide=guide)
     due = added != 0 or guide.chosen is None or guide.is_stale
@@ -320,8 +312,7 @@ def _draw_poses(session: Holder, sensor: Sensor, poses: Poses, *, added: int,
         return ''
     if plan is not None:
         session.change_sensor(guide=session.sensor.guide.choose(plan))
-        asked = session.sensor.guide.plan or plan  # as the next step asks
-        session.events.append(ShowPoses(plan.up, asked.asked, session.state.frame_id or ''))
+        session.events.append(ShowPoses(plan.up, session.state.frame_id or ''))
     if new_rest is None:
         return ''
     guide, step = session.sensor.guide, next_step(session.state)

@@ -51,7 +51,6 @@ from traceback import format_exc
 from typing import Any, cast, Literal, NamedTuple, TypeVar
 
 from .store import writing_advice
-from ..calibration import NextPose
 from ..errors import AccelCalibError, InputError, ONE_THREAD
 from ..table import Floats
 
@@ -237,11 +236,12 @@ class Compute(Step):
     """A function that computes, in the worker process; commands and files do not wait for it."""
 
 
-def answered(task: Task) -> Any:
-    """Run the steps of a task now, in this thread, and return its answer."""
+def answered(task: Task, before: Callable[[], object] = nothing) -> Any:
+    """Run the steps of a task now, in this thread, each after `before`; return its answer."""
     try:
         step = next(task)
         while True:
+            before()
             try:
                 found = step.run(lambda function, *given: function(*given))
             except Exception as error:  # the task can handle it
@@ -280,10 +280,9 @@ class Still(NamedTuple):
 
 
 class ShowPoses(NamedTuple):
-    """The poses to draw: (n, 3) directions of up in the sensor frame, and the next pose."""
+    """The poses to draw: (n, 3) directions of up in the sensor frame."""
 
     up: Floats
-    asked: NextPose
     frame_id: str
 
 

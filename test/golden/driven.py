@@ -62,10 +62,11 @@ class _Driver(Driver):
 
     def state(self) -> Any:
         """Return progress, diagnostics, checks and poses."""
-        drift = self.session.sensor.drift
+        drift, plan = self.session.sensor.drift, self.session.sensor.guide.plan
         return [progress(self.session.state), dict(health_figures(self.session.state)),
-                diagnostics(self.session.state)[1:], self.shown and {
-                    **those(self.shown, 'up frame_id'), 'asked': of_next_pose(self.shown.asked)},
+                diagnostics(self.session.state)[1:], plan and {
+                    'up': plan.up, 'frame_id': self.session.state.frame_id or '',
+                    'asked': of_next_pose(plan.asked)},
                 self.session.sensor.live.poses(),
                 drift and {'covariance': drift.calibration.covariance, **those(
                     drift, 'repeats temperatures rests count scatter change since without')}]
