@@ -205,10 +205,21 @@ def test_a_second_run_calibrates_what_is_new_and_all_with_other_options(
     (folder / 'robot_0' / '2026-01-03.csv').rename(folder / 'robot_0' / 'renamed.csv')
     assert run(client, found_in(folder), QUICK, store).counts == {'ok': 1, 'skipped': 2}
     assert rows_of(store.folder)[:2] == before
-    other = replace(QUICK, log=replace(QUICK.log, gravity=9.81))
-    for options in (other, QUICK):
-        assert run(client, found_in(folder), options, store).counts == {'ok': 3}
-        assert len(rows_of(store.folder)) == 3
+    bad = folder / 'robot_0' / 'bad.csv'
+    bad.write_text('nothing of use\n')
+    assert run(client, found_in(folder), QUICK, store).counts == {'error': 1, 'skipped': 3}
+    write_poses(bad, seed=8)
+    other, name = replace(QUICK, log=replace(QUICK.log, gravity=9.81)), 'robot_0/imu_link'
+    for options, sensor, count in ((QUICK, name, 1), (other, name, 4), (QUICK, name, 4),
+                                   (replace(QUICK, sensor_from='robot_.'), 'robot_0', 4)):
+        summary = run(client, found_in(folder), options, store)
+        assert (summary.counts['ok'], summary.rating.name) == (count, 'GOOD')
+        rows = rows_of(store.folder)
+        assert {(len(rows), row['sensor']) for row in rows} == {(4, sensor)}
+        assert [row['sensor'] for row in summary.sensors] == [sensor]
+        files = (store.folder / 'calibrations').rglob('*.yaml')
+        assert {row['calibration'] for row in rows} == {
+            str(path.relative_to(store.folder)) for path in files}
 
 
 def test_a_change_for_good_is_named_and_an_odd_calibration_is_not(
@@ -529,7 +540,7 @@ def undisturbed(client: Any, recorded: Path, tmp_path_factory: pytest.TempPathFa
     summary = run(client, found_in(recorded), QUICK, Store(results))
     assert summary.counts == {'ok': COUNT - 1, 'error': 1}
     found = state_of(results)
-    assert len(found['rows']) == len(found['done']) == COUNT
+    assert 2 * len(found['rows']) == len(found['done']) == 2 * COUNT
     assert len(found['texts']) == COUNT - 1
     return results
 
