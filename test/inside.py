@@ -47,7 +47,7 @@ from accel_calib.fleet.overview import (
     digest, digest_of, estimated, not_agreeing, odd_sensors, OfModel, overview, priors_of,
     shared_effects, typical_of, Values as SensorValues, write_fleet_page)
 from accel_calib.fleet.recording import (
-    as_folder, content_hash, date_of, on_disk, schema, sensor_of)
+    as_folder, content_hash, date_of, on_disk, row_of, schema, sensor_of)
 from accel_calib.fleet.run import mapped
 from accel_calib.fleet.sensors import alike, drift_of, merge_sensor, write_parquet
 from accel_calib.geometry import (

@@ -35,7 +35,7 @@ from fleet_case import (
     found_in, OFFSET, page_of, QUICK, rows_of, state_of, write_fleet, write_poses)
 from inside import (
     alike, as_folder, COMMAND, content_hash, date_of, export, main, mapped, on_disk, overview,
-    sensor_of)
+    row_of, sensor_of)
 import numpy as np
 import pytest
 from shared import OWN, python, run_on_small_disk, run_snippets, table, wait
@@ -235,6 +235,18 @@ def test_a_change_for_good_is_named_and_an_odd_calibration_is_not(
     assert (single['for_good'], single['date'][:7]) == (False, '2026-02')
     assert change['parameter'] == 'offset.z'
     assert change['change'] == pytest.approx(0.02, abs=5.0 * change['sd'])
+
+
+def test_the_weather_changes_no_value_of_a_sensor(tmp_path: Path) -> None:
+    effects, rows = {'offset': OFFSET, 'offset_temperature': (0.001, -0.001, 0.0005)}, []
+    for month, limits in enumerate(((0.0, 20.0), (20.0, 50.0)), 1):
+        path = tmp_path / f'2026-{month:02d}-03.csv'
+        write_table(path, simulate(effects, poses=24, seed=month, temperature=limits))
+        rows.append(row_of(Input(str(path), path.name), path, Options())[0])
+    for name, true in zip(('offset.x', 'offset.y', 'offset.z'), OFFSET):
+        assert all(abs(row[name] - true) < 5.0 * row[f'{name}.sd'] < 0.002 for row in rows)
+    assert [each['name'].partition('.')[0] for each in rows[0]['parameters']].count(
+        'offset_temperature') == 3  # the lag is none
 
 
 def test_poses_that_do_not_determine_all_values_are_no_change(calibrate: Any, tmp_path: Path

@@ -33,11 +33,12 @@ from .. import __version__
 from ..calibration import Calibration, determines, directions_of, fit_poses
 from ..comparison import NAMES, rotation_free
 from ..disk import check_regular
-from ..effects import MODELS, OwnEffect
+from ..effects import MODELS, NOMINAL_SUPPLY, OwnEffect, REFERENCE_TEMPERATURE
 from ..errors import AccelCalibError, InputError, known_error, RefusedFitError
 from ..findings import residual_figures
 from ..logs import LogOptions, SUFFIXES
 from ..pipeline import calibrated, Intake, Outcome, Plan, poses_of
+from ..stored.made import steady_context
 from ..table import Poses
 from ..text import one_line
 
@@ -292,7 +293,7 @@ _NUMBERS = ('rms_before_mg', 'rms_after_mg', 'held_out_rms_mg', 'noise_floor_mg'
             'temperature', 'seconds',
             *(column for name in NAMES for column in (name, f'{name}.sd')))
 
-RESULTS = 2
+RESULTS = 3
 """Version of the rows. Another version makes all recordings be calibrated again."""
 
 _WHOLE_MODEL = '10'
@@ -411,8 +412,10 @@ def _figures(intake: Intake, outcome: Outcome) -> Row:
     poses = calibration.used_poses
     warm = float(np.median(poses['temperature'])) if 'temperature' in poses else None
     deviation = np.sqrt(np.diag(calibration.covariance))
-    # Offset and gain at the middle of the context.
-    free = rotation_free(calibration, calibration.typical_context(1), calibration.units.per_g)
+    # Offset and gain in one context, so that a change of the weather is no change of a sensor.
+    here = {**steady_context(calibration, np.array([REFERENCE_TEMPERATURE])),
+            'supply_voltage': np.array([NOMINAL_SUPPLY])}
+    free = rotation_free(calibration, here, calibration.units.per_g)
     variance = np.einsum('tp,pq,tq->t', free.slope, calibration.covariance, free.slope)
     row: Row = {
         'status': 'ok', 'rating': outcome.rating.name, 'rating_reason': outcome.rating.reason,
@@ -422,9 +425,11 @@ def _figures(intake: Intake, outcome: Outcome) -> Row:
         **{figure.key: figure.value for figure in residual_figures(quality)},
         'temperature': warm, 'warnings': list(calibration.warnings),
         'determined': determines(_WHOLE_MODEL, directions_of(poses, intake.units)),
-        'parameters': [{'name': str(name), 'value': value, 'sd': sd} for name, value, sd in zip(
-            calibration.parameters, calibration.model.vector.tolist(), deviation.tolist(),
-            strict=True)],
+        'parameters': [{'name': str(name), 'value': value, 'sd': sd}
+                       for name, value, sd, is_stated in zip(
+                           calibration.parameters, calibration.model.vector.tolist(),
+                           deviation.tolist(), calibration.model.stated, strict=True)
+                       if is_stated],
         **{column: float(value) for k, name in enumerate(NAMES) for column, value in (
             (name, free.values[k]), (f'{name}.sd', np.sqrt(max(variance[k], 0.0))))}}
     if not intake.units.is_native:
