@@ -229,7 +229,10 @@ def test_a_change_for_good_is_named_and_an_odd_calibration_is_not(
                                         (moved, OFFSET)], 1):
         write_poses(tmp_path / 'in' / 'changed' / f'2026-{k:02d}-01.csv', changed, seed=k)
         write_poses(tmp_path / 'in' / 'odd' / f'2026-{k:02d}-01.csv', odd, seed=10 + k)
-    changes = {row['sensor'].split('/')[0]: row['changes'] for row in calibrate().sensors}
+    summary = calibrate()
+    changes = {row['sensor'].split('/')[0]: row['changes'] for row in summary.sensors}
+    assert sorted((sensor, lasts) for sensor, _, _, lasts in summary.changes) == [
+        ('changed/imu_link', 'for good'), ('odd/imu_link', 'this calibration only')]
     (change,), (single,) = changes['changed'], changes['odd']
     assert (change['for_good'], change['date'][:7]) == (True, '2026-03')
     assert (single['for_good'], single['date'][:7]) == (False, '2026-02')

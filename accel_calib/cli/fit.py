@@ -310,9 +310,7 @@ def run_fleet(args: argparse.Namespace) -> Done:
          f'could not be read, {counts["skipped"]} skipped because they are done',
          *(f'note: a file of the results was damaged and was made again; it is now {path}'
            for path in summary.damaged),
-         *(f'{row["sensor"]} changed for good at {change["date"]}: {change["parameter"]} '
-           f'(p = {change["p_value"]:.2g})'
-           for row in summary.sensors for change in row['changes'] if change['for_good']),
+         *(f'{sensor}: {", ".join(filter(None, about))}' for sensor, *about in summary.changes),
          f'{counted(len(summary.sensors), "sensor")}, stored in {args.output}'],
         summary.rating)
 
