@@ -80,7 +80,7 @@ from accel_calib.refinement.state import (
 from accel_calib.refinement.steps import remarks_on
 from accel_calib.report.page import all_drawings, axis_figures, curve_parts
 from accel_calib.report.residuals import residuals_of
-from accel_calib.report.sheet import page as page_of
+from accel_calib.report.sheet import drawn, page as page_of
 from accel_calib.report.stability import comparison_page
 from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store, worker

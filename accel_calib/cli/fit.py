@@ -242,7 +242,7 @@ def run_refine(args: argparse.Namespace) -> Done:
                 [*([table] if result.steps else ()), *plan, *left_out], rating,
                 stored=stored, refusal=result.refusal if args.output else (),
                 page=partial(calibration_page, result.calibration, rating, str(args.poses),
-                             refinement=result),
+                             refinement=result, stored=str(args.output or 'calibration.yaml')),
                 notes=[verdict_words(result),
                        *([f'left out: {listed("row", rows)}'] if rows else ()),
                        *(f'advice: {line}' for line in result.advice), *found.lines,
