@@ -127,7 +127,7 @@ def test_labels_of_a_small_quantity_are_apart():
         panel.plot([6.6e-5, 3.94e-4], [0.0, 1.0])
         figure.draw_without_rendering()
         labels = [each.get_window_extent() for each in panel.get_xticklabels()]
-    assert all(one.x1 + one.height / 2 < other.x0 for one, other in pairwise(labels))
+    assert all(one.x1 + one.height < other.x0 for one, other in pairwise(labels))
 
 
 def test_hostile_names_are_text(calibration, poses):
