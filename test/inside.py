@@ -47,7 +47,7 @@ from accel_calib.fleet.overview import (
     digest, digest_of, estimated, not_agreeing, odd_sensors, OfModel, overview, priors_of,
     shared_effects, typical_of, Values as SensorValues, write_fleet_page)
 from accel_calib.fleet.recording import (
-    as_folder, content_hash, date_of, on_disk, schema, sensor_of)
+    as_folder, content_hash, date_of, on_disk, row_of, schema, sensor_of)
 from accel_calib.fleet.run import mapped
 from accel_calib.fleet.sensors import alike, drift_of, merge_sensor, write_parquet
 from accel_calib.geometry import (
@@ -77,7 +77,7 @@ from accel_calib.refinement.state import (
 from accel_calib.refinement.steps import remarks_on
 from accel_calib.report.page import all_drawings, axis_figures, curve_parts
 from accel_calib.report.residuals import residuals_of
-from accel_calib.report.sheet import page as page_of
+from accel_calib.report.sheet import drawn, page as page_of
 from accel_calib.report.stability import comparison_page
 from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store, worker

@@ -209,6 +209,8 @@ def test_the_report_has_a_page_and_figures(poses, tmp_path):
     assert page.read_text().startswith('<!DOCTYPE html>')
     names = {path.name for path in folder.iterdir()}
     assert {'ladder.svg', 'ladder.png', 'remaining_sphere.png'} <= names
+    assert run('refine', poses, '-o', tmp_path / 'mine.yaml', '--report', page) == 0
+    assert {*re.findall(r'\w+\.yaml', page.read_text())} == {'mine.yaml'}
 
 
 @pytest.mark.parametrize(('module', 'line'), [

@@ -9,6 +9,7 @@ from typing import Any
 
 from accel_calib.calibration import Calibration, fit_poses, level
 from accel_calib.comparison import compare, compared, Drift, history_of, rest_errors, status
+from accel_calib.effects import effect_named
 from accel_calib.estimate import estimate
 from accel_calib.logs import read_recording
 from accel_calib.stillness import capture
@@ -168,13 +169,16 @@ def test_a_history_compares_each_pair_with_the_uncertainty_of_the_largest_model(
     assert compare(calibrations[:2]).parameters[6].stated_sd[0] == 0.0
 
 
-def test_runs_at_other_temperatures_agree_when_they_correct_for_it():
+@pytest.mark.parametrize(('column', 'effect', 'zero'), [
+    ('temperature', 'offset_temperature', ()),
+    ('motor_current', 'offset_covariate-motor_current', (25.0,))])
+def test_runs_in_another_context_agree_when_they_correct_for_it(column, effect, zero):
     rng = np.random.default_rng(10)
-    effects = {**sensor(rng).values, 'offset_temperature': np.array([5e-4, -4e-4, 3e-4])}
+    effects = {**sensor(rng).values, effect_named(effect): np.array([5e-4, -4e-4, 3e-4, *zero])}
     model = model_with(effects)
 
     def run(middle):
-        warm = {'temperature': rng.uniform(middle - 10.0, middle + 10.0, 30)}
+        warm = {column: rng.uniform(middle - 10.0, middle + 10.0, 30)}
         poses = simulate_poses(model, attitudes(rng, 30), rng, context=warm)
         plain = fit_poses(poses, G, model='10')
         fit = estimate(model, poses)

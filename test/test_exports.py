@@ -258,6 +258,8 @@ def test_betaflight_gets_its_offsets_in_counts(options, unit, per_g, scale):
         round(each * scale) for each in BY_AXIS['offset']]
     losses = export(made, 'betaflight', options=ExportOptions(**options)).losses
     assert all(' offset to counts: ' in each for each in losses if 'rounds' in each)
+    losses = export(made, 'inav', options=ExportOptions(**options)).losses
+    assert all(' rounds the ' in each or each.startswith('iNav leaves ') for each in losses)
 
 
 def imu_calib(text, raw):

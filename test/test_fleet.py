@@ -35,7 +35,7 @@ from fleet_case import (
     found_in, OFFSET, page_of, QUICK, rows_of, state_of, write_fleet, write_poses)
 from inside import (
     alike, as_folder, COMMAND, content_hash, date_of, export, main, mapped, on_disk, overview,
-    sensor_of)
+    row_of, sensor_of)
 import numpy as np
 import pytest
 from shared import OWN, python, run_on_small_disk, run_snippets, table, wait
@@ -205,10 +205,21 @@ def test_a_second_run_calibrates_what_is_new_and_all_with_other_options(
     (folder / 'robot_0' / '2026-01-03.csv').rename(folder / 'robot_0' / 'renamed.csv')
     assert run(client, found_in(folder), QUICK, store).counts == {'ok': 1, 'skipped': 2}
     assert rows_of(store.folder)[:2] == before
-    other = replace(QUICK, log=replace(QUICK.log, gravity=9.81))
-    for options in (other, QUICK):
-        assert run(client, found_in(folder), options, store).counts == {'ok': 3}
-        assert len(rows_of(store.folder)) == 3
+    bad = folder / 'robot_0' / 'bad.csv'
+    bad.write_text('nothing of use\n')
+    assert run(client, found_in(folder), QUICK, store).counts == {'error': 1, 'skipped': 3}
+    write_poses(bad, seed=8)
+    other, name = replace(QUICK, log=replace(QUICK.log, gravity=9.81)), 'robot_0/imu_link'
+    for options, sensor, count in ((QUICK, name, 1), (other, name, 4), (QUICK, name, 4),
+                                   (replace(QUICK, sensor_from='robot_.'), 'robot_0', 4)):
+        summary = run(client, found_in(folder), options, store)
+        assert (summary.counts['ok'], summary.rating.name) == (count, 'GOOD')
+        rows = rows_of(store.folder)
+        assert {(len(rows), row['sensor']) for row in rows} == {(4, sensor)}
+        assert [row['sensor'] for row in summary.sensors] == [sensor]
+        files = (store.folder / 'calibrations').rglob('*.yaml')
+        assert {row['calibration'] for row in rows} == {
+            str(path.relative_to(store.folder)) for path in files}
 
 
 def test_a_change_for_good_is_named_and_an_odd_calibration_is_not(
@@ -218,12 +229,27 @@ def test_a_change_for_good_is_named_and_an_odd_calibration_is_not(
                                         (moved, OFFSET)], 1):
         write_poses(tmp_path / 'in' / 'changed' / f'2026-{k:02d}-01.csv', changed, seed=k)
         write_poses(tmp_path / 'in' / 'odd' / f'2026-{k:02d}-01.csv', odd, seed=10 + k)
-    changes = {row['sensor'].split('/')[0]: row['changes'] for row in calibrate().sensors}
+    summary = calibrate()
+    changes = {row['sensor'].split('/')[0]: row['changes'] for row in summary.sensors}
+    assert sorted((sensor, lasts) for sensor, _, _, lasts in summary.changes) == [
+        ('changed/imu_link', 'for good'), ('odd/imu_link', 'this calibration only')]
     (change,), (single,) = changes['changed'], changes['odd']
     assert (change['for_good'], change['date'][:7]) == (True, '2026-03')
     assert (single['for_good'], single['date'][:7]) == (False, '2026-02')
     assert change['parameter'] == 'offset.z'
     assert change['change'] == pytest.approx(0.02, abs=5.0 * change['sd'])
+
+
+def test_the_weather_changes_no_value_of_a_sensor(tmp_path: Path) -> None:
+    effects, rows = {'offset': OFFSET, 'offset_temperature': (0.001, -0.001, 0.0005)}, []
+    for month, limits in enumerate(((0.0, 20.0), (20.0, 50.0)), 1):
+        path = tmp_path / f'2026-{month:02d}-03.csv'
+        write_table(path, simulate(effects, poses=24, seed=month, temperature=limits))
+        rows.append(row_of(Input(str(path), path.name), path, Options())[0])
+    for name, true in zip(('offset.x', 'offset.y', 'offset.z'), OFFSET):
+        assert all(abs(row[name] - true) < 5.0 * row[f'{name}.sd'] < 0.002 for row in rows)
+    assert [each['name'].partition('.')[0] for each in rows[0]['parameters']].count(
+        'offset_temperature') == 3  # the lag is none
 
 
 def test_poses_that_do_not_determine_all_values_are_no_change(calibrate: Any, tmp_path: Path
@@ -529,7 +555,7 @@ def undisturbed(client: Any, recorded: Path, tmp_path_factory: pytest.TempPathFa
     summary = run(client, found_in(recorded), QUICK, Store(results))
     assert summary.counts == {'ok': COUNT - 1, 'error': 1}
     found = state_of(results)
-    assert len(found['rows']) == len(found['done']) == COUNT
+    assert 2 * len(found['rows']) == len(found['done']) == 2 * COUNT
     assert len(found['texts']) == COUNT - 1
     return results
 

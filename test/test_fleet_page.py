@@ -79,7 +79,9 @@ def test_few_of_many_unchanged_sensors_are_named_as_changed() -> None:
 
 def test_bad_calibrations_and_errors_do_not_enter_the_values() -> None:
     def row(status: str, rating: str | None, offset: float) -> dict[str, object]:
-        return {'prior_values': None, 'sensor_model': None, 'status': status, 'rating': rating,
+        return {'prior_values': [offset] * 9 if rating == 'BAD' else None,
+                'prior_covariance': [0.0] * 81, 'sensor_model': None, 'status': status,
+                'rating': rating,
                 'calibration': 'a.yaml' if rating in ('GOOD', 'USABLE') else None,
                 'determined': offset < 1.0, 'effects': [], 'parameters': [],
                 **dict.fromkeys(NAMES, offset)}
@@ -90,7 +92,7 @@ def test_bad_calibrations_and_errors_do_not_enter_the_values() -> None:
     np.testing.assert_allclose(known.models[''].values['s'].mean, 0.02)
     assert known.counts == {'GOOD': 1, 'USABLE': 2, 'BAD': 1, 'error': 1}
     assert known.left_out == 1
-    assert len(known.errors) == 1
+    assert (len(known.errors), known.typical) == (2, [])  # BAD, and the error
 
 
 def test_a_value_that_is_known_badly_is_not_odd() -> None:

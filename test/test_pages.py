@@ -6,6 +6,7 @@
 from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
+from itertools import pairwise
 from pathlib import Path
 import re
 
@@ -19,8 +20,8 @@ from accel_calib.report import calibration_page, refinement_page
 from accel_calib.statistics import rms
 from accel_calib.text import milli
 from inside import (
-    all_drawings, axis_figures, comparison_page, curve_parts, linear_model, model_with, page_of,
-    residuals_of, simulate_poses)
+    all_drawings, axis_figures, comparison_page, curve_parts, drawn, linear_model, model_with,
+    page_of, residuals_of, simulate_poses)
 from live_bench import PATIENCE
 import numpy as np
 from playwright.sync_api import expect
@@ -119,6 +120,14 @@ def test_every_figure_has_a_text_and_every_pose_can_be_pointed_at(text, poses, c
         # Before; coverage, after, by direction, against temperature and against time.
         assert sorted(mine) == sorted([one, *[other] * 5])
     assert {*rows_in(found, 'tr')} == {*rows_in(found, 'use')} == {*map(str, poses.row)}
+
+
+def test_labels_of_a_small_quantity_are_apart():
+    with drawn(2.0) as (figure, (panel,)):
+        panel.plot([6.6e-5, 3.94e-4], [0.0, 1.0])
+        figure.draw_without_rendering()
+        labels = [each.get_window_extent() for each in panel.get_xticklabels()]
+    assert all(one.x1 + one.height < other.x0 for one, other in pairwise(labels))
 
 
 def test_hostile_names_are_text(calibration, poses):

@@ -32,8 +32,8 @@ def tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
         path = folder / f'{kind}.csv'
         assert main(['simulate', '-o', str(path), '--effect', 'offset=0.01,0.02,0.03',
                      *options]) == 0
-        for name in ('a', 'b'):
-            (folder / f'{kind}_{name}.csv').write_text(f'# sensor: "{name}"\n{path.read_text()}')
+        for name, text in (('a', '"a"'), ('b', 'b')):
+            (folder / f'{kind}_{name}.csv').write_text(f'# sensor: {text}\n{path.read_text()}')
         path.rename(folder / f'{kind}_.csv')
     return folder
 

@@ -242,7 +242,7 @@ def run_refine(args: argparse.Namespace) -> Done:
                 [*([table] if result.steps else ()), *plan, *left_out], rating,
                 stored=stored, refusal=result.refusal if args.output else (),
                 page=partial(calibration_page, result.calibration, rating, str(args.poses),
-                             refinement=result),
+                             refinement=result, stored=str(args.output or 'calibration.yaml')),
                 notes=[verdict_words(result),
                        *([f'left out: {listed("row", rows)}'] if rows else ()),
                        *(f'advice: {line}' for line in result.advice), *found.lines,
@@ -310,9 +310,7 @@ def run_fleet(args: argparse.Namespace) -> Done:
          f'could not be read, {counts["skipped"]} skipped because they are done',
          *(f'note: a file of the results was damaged and was made again; it is now {path}'
            for path in summary.damaged),
-         *(f'{row["sensor"]} changed for good at {change["date"]}: {change["parameter"]} '
-           f'(p = {change["p_value"]:.2g})'
-           for row in summary.sensors for change in row['changes'] if change['for_good']),
+         *(f'{sensor}: {", ".join(filter(None, about))}' for sensor, *about in summary.changes),
          f'{counted(len(summary.sensors), "sensor")}, stored in {args.output}'],
         summary.rating)
 

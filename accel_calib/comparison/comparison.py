@@ -29,7 +29,7 @@ from ..text import counted, listed
 from ..units import Floats, MG
 
 _COMMON = ('temperature', 'supply_voltage')
-"""Context that is set to the same value for all runs; other context is specific to a run."""
+"""Context that has one value for all runs, as quantities have; other context is that of a run."""
 
 _WARMER = 5.0
 """Difference of temperature between runs that causes a note [°C]."""
@@ -226,9 +226,9 @@ def _prepare(given: Sequence[Comparable]) -> Sequence[tuple[Context, RotationFre
     """
     calibrations = [run.calibration for run in given]
     per_g = float(np.mean([run.units.per_g for run in calibrations]))
-    common = {key: np.array([np.mean([np.median(run.poses[key]) for run in calibrations
-                                      if key in run.poses])])
-              for key in _COMMON if any(key in run.poses for run in calibrations)}
+    known = [{*run.poses.quantities, *_COMMON} & {*run.poses.columns} for run in calibrations]
+    common = {key: np.array([np.mean([np.nanmedian(run.poses[key]) for run, own in zip(
+        calibrations, known, strict=True) if key in own])]) for key in set[str]().union(*known)}
     found = []
     for run in given:
         poses, still = run.calibration.poses, np.zeros((1, 3))

@@ -66,7 +66,7 @@ from ..table import Floats
 from ..text import counted, short, with_minus
 
 MOST_ERRORS = 200
-"""Largest number of errors that are kept."""
+"""Largest number of recordings without a calibration that are kept."""
 
 FEWEST = 5
 """Smallest number of sensors of a model, or calibrations of a month, for statistics."""
@@ -136,7 +136,7 @@ class Digest:
     What the statistics need of a sensor.
 
     `counts` are recordings by rating, or by status without a rating. `errors` are the first
-    `MOST_ERRORS` rows with an error. `left_out` recordings have a calibration that is not
+    `MOST_ERRORS` rows without a calibration. `left_out` recordings have a calibration that is not
     compared; `values` are those that are, and None without any. `differences` (9,) from the median
     of the sensor are those of calibrations with a date, with their month; there are none of a
     single calibration. `typical` is for `priors_of`.
@@ -174,9 +174,9 @@ def digest(sensor: str, rows: Sequence[Row]) -> Digest:
     return Digest(
         sensor=sensor, model=model_of(rows), values=known, differences=differences,
         counts=Counter(row['rating'] or row['status'] for row in rows),
-        errors=[row for row in rows if row['status'] != 'ok'][:MOST_ERRORS],
+        errors=[row for row in rows if not row['calibration']][:MOST_ERRORS],
         left_out=sum(bool(row['calibration']) for row in rows) - len(good),
-        typical=typical_of(named))
+        typical=typical_of(row for row in named if row['calibration']))
 
 
 @dataclass
@@ -346,6 +346,23 @@ _DRIFTS = 0.05
 """Probability below which a drift is stated."""
 
 
+def changes_of(sensors: Iterable[Row]) -> list[tuple[str, str, str, str]]:
+    """Return sensor, recording, words and duration of the changes of sensors that differ."""
+    found = []
+    for row in not_agreeing(sensors):
+        sensor, drift = row['sensor'], row.get('drift')
+        for change in row['changes']:
+            date, path = (change['date'] or '')[:10], change.get('recording') or ''
+            words = change_words(change['parameter'], change['change'], change['sd'])
+            found.append((sensor, f'{date} {path}'.strip(), words, _LASTING[change['for_good']]))
+        if drift and drift['p_value'] < _DRIFTS:
+            words = change_words(drift['parameter'], drift['per_year'], drift['sd'])
+            found.append((sensor, '', f'{words} per year', 'drift'))
+        elif not row['changes']:
+            found.append((sensor, '', 'no step or drift that is significant alone', ''))
+    return found
+
+
 def write_fleet_page(store: Store, known: Overview, sensors: Sequence[Row],
                      priors: Mapping[str, FleetPrior]) -> None:
     """Write the page of all sensors, with typical values by model; raise OSError if it fails."""
@@ -358,26 +375,15 @@ def write_fleet_page(store: Store, known: Overview, sensors: Sequence[Row],
         odd_names += [sensor for sensor, _, _, _ in odd]
         prefix = f'model{number}' if drawn_too and number < _MOST_MODELS else ''
         models.append({'name': name, **_section(own, odd, priors.get(name), prefix)})
-    changes = list[tuple[str, ...]]()  # lines about the sensors whose calibrations differ
-    for row in differ:
-        sensor, drift = row['sensor'], row.get('drift')
-        for change in row['changes']:
-            date, path = (change['date'] or '')[:10], change.get('recording') or ''
-            words = change_words(change['parameter'], change['change'], change['sd'])
-            changes.append((sensor, f'{date} {path}'.strip(), words, _LASTING[change['for_good']]))
-        if drift and drift['p_value'] < _DRIFTS:
-            words = change_words(drift['parameter'], drift['per_year'], drift['sd'])
-            changes.append((sensor, '', f'{words} per year', 'drift'))
-        elif not row['changes']:
-            changes.append((sensor, '', 'no step or drift that is significant alone', ''))
     drawings, others = _over_time(store, sensors, differ, odd_names) if drawn_too else ([], 0)
     write_page(store.folder / PAGE, page(
         'fleet', 'Fleet', (), rating_of(known, sensors), heading='Calibrations of a fleet',
         script=False,  # the browser shows the text of a marker that is pointed at
         has_figures=drawn_too, left_out=known.left_out, models=models, most_models=_MOST_MODELS,
-        differ=differ, changes=changes, over_time=drawings, others=others,
-        failed=sum(known.counts[status] for status in ('error', 'unread')),
-        errors=[(row['recording'], row['error'], row['advice']) for row in known.errors]))
+        differ=differ, changes=changes_of(sensors), over_time=drawings, others=others,
+        failed=sum(known.counts[status] for status in ('BAD', 'error', 'unread')),
+        errors=[(row['recording'], row['error'] or f'BAD: {row["rating_reason"]}', row['advice'])
+                for row in known.errors]))
 
 
 def _section(known: OfModel, odd: Sequence[Odd], prior: FleetPrior | None, prefix: str

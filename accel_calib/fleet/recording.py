@@ -33,11 +33,12 @@ from .. import __version__
 from ..calibration import Calibration, determines, directions_of, fit_poses
 from ..comparison import NAMES, rotation_free
 from ..disk import check_regular
-from ..effects import MODELS, OwnEffect
+from ..effects import MODELS, NOMINAL_SUPPLY, OwnEffect, REFERENCE_TEMPERATURE
 from ..errors import AccelCalibError, InputError, known_error, RefusedFitError
 from ..findings import residual_figures
 from ..logs import LogOptions, SUFFIXES
 from ..pipeline import calibrated, Intake, Outcome, Plan, poses_of
+from ..stored.made import steady_context
 from ..table import Poses
 from ..text import one_line
 
@@ -292,7 +293,7 @@ _NUMBERS = ('rms_before_mg', 'rms_after_mg', 'held_out_rms_mg', 'noise_floor_mg'
             'temperature', 'seconds',
             *(column for name in NAMES for column in (name, f'{name}.sd')))
 
-RESULTS = 2
+RESULTS = 3
 """Version of the rows. Another version makes all recordings be calibrated again."""
 
 _WHOLE_MODEL = '10'
@@ -408,30 +409,31 @@ def _about(found: Input, options: Options, poses: Poses | None, path: Path | Non
 def _figures(intake: Intake, outcome: Outcome) -> Row:
     """Return the columns of a calibration and its rating."""
     calibration, quality = outcome.calibration, outcome.calibration.quality
-    poses = calibration.used_poses
+    poses, model = calibration.used_poses, calibration.model
     warm = float(np.median(poses['temperature'])) if 'temperature' in poses else None
-    deviation = np.sqrt(np.diag(calibration.covariance))
-    # Offset and gain at the middle of the context.
-    free = rotation_free(calibration, calibration.typical_context(1), calibration.units.per_g)
+    # Offset and gain in one context, so that a change of the weather is no change of a sensor.
+    here = {**steady_context(calibration, np.array([REFERENCE_TEMPERATURE])),
+            'supply_voltage': np.array([NOMINAL_SUPPLY])}
+    free = rotation_free(calibration, here, calibration.units.per_g)
     variance = np.einsum('tp,pq,tq->t', free.slope, calibration.covariance, free.slope)
     row: Row = {
         'status': 'ok', 'rating': outcome.rating.name, 'rating_reason': outcome.rating.reason,
-        'model': calibration.name, 'effects': [*map(str, calibration.model.effects)],
+        'model': calibration.name, 'effects': [*map(str, model.effects)],
         'refined': outcome.line, 'units': intake.units.name, 'poses': len(calibration.poses),
         'poses_used': len(poses), 'coverage': quality.coverage,
         **{figure.key: figure.value for figure in residual_figures(quality)},
         'temperature': warm, 'warnings': list(calibration.warnings),
         'determined': determines(_WHOLE_MODEL, directions_of(poses, intake.units)),
-        'parameters': [{'name': str(name), 'value': value, 'sd': sd} for name, value, sd in zip(
-            calibration.parameters, calibration.model.vector.tolist(), deviation.tolist(),
-            strict=True)],
+        'parameters': [{'name': str(name), 'value': value, 'sd': sd} for (name, sd), value, stated
+                       in zip(calibration.deviations.items(), model.vector.tolist(), model.stated,
+                              strict=True) if stated],
         **{column: float(value) for k, name in enumerate(NAMES) for column, value in (
             (name, free.values[k]), (f'{name}.sd', np.sqrt(max(variance[k], 0.0))))}}
     if not intake.units.is_native:
         # Values of model 10 for the prior, if the poses determine it.
         with suppress(RefusedFitError):
             whole = calibration
-            if calibration.model.effects != MODELS[_WHOLE_MODEL].effects:
+            if model.effects != MODELS[_WHOLE_MODEL].effects:
                 whole = fit_poses(intake.poses, intake.units, model=_WHOLE_MODEL)
             row |= {'prior_values': whole.model.vector.tolist(),
                     'prior_covariance': whole.covariance.ravel().tolist()}

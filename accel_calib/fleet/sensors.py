@@ -5,10 +5,11 @@
 The rows on a disk: a Parquet data set with each result once; and each sensor over time.
 
 **Store.** A worker writes a row to ``pending/<sensor>/<key>.json``. `Store.merge` adds the rows of
-a sensor to its Parquet file, and then marks their keys as done. `Store.finish` removes the pending
-rows when all that depends on them is written. Each step replaces files atomically, and the rows
-are merged by content. So a run can stop anywhere, and the next run merges the same rows again.
-Errors of the store, such as a full disk, are raised: they concern all recordings.
+a sensor to its Parquet file, and then marks their keys as done, and which sensor has the
+recording. `Store.finish` removes the pending rows when all that depends on them is written. Each
+step replaces files atomically, and the rows are merged by content. So a run can stop anywhere, and
+the next run merges the same rows again. Errors of the store, such as a full disk, are raised: they
+concern all recordings.
 
 **Calibrations that are compared.** A calibration is compared as if its effects were known to be
 right. A search in few poses sometimes names another effect than in the other recordings, and
@@ -39,6 +40,7 @@ from hashlib import blake2b
 import json
 import os
 from pathlib import Path
+import shutil
 import time
 from typing import Any, TYPE_CHECKING
 from urllib.parse import unquote
@@ -90,16 +92,20 @@ class Store:
         """
         Write a row, to be merged into the data set; raise OSError if it fails.
 
-        ValueError is raised for a row that the data set cannot hold.
+        It is written for its sensor, and for the one that has the recording so far. ValueError is
+        raised for a row that the data set cannot hold.
 
         """
         import pyarrow as pa
 
-        folder = self.folder / 'pending' / as_folder(row['sensor'])
-        folder.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(row)
+        text, names = json.dumps(row), {as_folder(row['sensor'])}
         pa.Table.from_pylist([json.loads(text)], schema())
-        write_atomically(folder / f'{row["key"]}.json', lambda file: file.write(_sealed(text)))
+        if (place := self.place(row['recording'])).exists():
+            names.add(place.read_text(encoding='utf-8').partition('\n')[0])
+        for name in names:
+            path = self.folder / 'pending' / name / f'{row["key"]}.json'
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, lambda file: file.write(_sealed(text)))
 
     def waiting(self) -> list[str]:
         """Return the folders of sensors with pending rows, in order."""
@@ -109,25 +115,36 @@ class Store:
         """
         Add the pending rows of a sensor, by the name of its folder, to its Parquet file.
 
-        They replace rows of the same content. The rows are in order of date. If it raises OSError,
-        the next `merge` completes it.
+        They replace rows of the same content, and rows of the same recording that have an error.
+        A pending row of another sensor replaces the row of the recording here. The rows are in
+        order of date. If it raises OSError, the next `merge` completes it.
 
         """
-        folder = self.folder / 'pending' / name
+        folder, data = self.folder / 'pending' / name, self.data(name)
         paths = sorted(folder.glob('*.json'), key=lambda path: path.stat().st_mtime)
         new = [_pending_row(path) for path in paths]
-        old, newest = read_parquet(self.data(name)), {row['content']: row for row in new}
-        if new:
-            kept = [row for row in old if row['content'] not in newest]
-            write_parquet(self.data(name), sorted((*kept, *newest.values()), key=lambda row: (
+        if not new:
+            return
+        content = {row['recording']: row['content'] for row in new}
+        old, added = read_parquet(data), [row for row in new if as_folder(row['sensor']) == name]
+        newest = {row['content']: row for row in added}
+        rows = [row for row in old if row['content'] not in newest and (
+            row['recording'] not in content
+            or (row['status'] == 'ok' and row['content'] != content[row['recording']]))]
+        rows += newest.values()
+        if rows:
+            write_parquet(data, sorted(rows, key=lambda row: (
                 row['date'] or '', row['recording'])), schema())
-        for row in (*old, *new):
-            if newest.get(row['content'], row)['key'] != row['key']:
-                self.mark(row['key']).unlink(missing_ok=True)
-        for row in new:
-            mark = self.mark(row['key'])
-            mark.parent.mkdir(parents=True, exist_ok=True)
-            mark.write_text(f'{name}\n{row.get("calibration", "")}', encoding='utf-8')
+        else:
+            shutil.rmtree(data.parent, ignore_errors=True)
+        for key in {row['key'] for row in (*old, *added)} - {row['key'] for row in rows}:
+            self.mark(key).unlink(missing_ok=True)
+            for path in (self.folder / 'calibrations' / name).glob(f'{key}*'):
+                path.unlink(missing_ok=True)
+        for row in added:
+            for mark in (self.mark(row['key']), self.place(row['recording'])):
+                mark.parent.mkdir(parents=True, exist_ok=True)
+                mark.write_text(f'{name}\n{row.get("calibration", "")}', encoding='utf-8')
 
     def finish(self, name: str) -> None:
         """Remove the pending rows of a sensor that are in the data set."""
@@ -183,6 +200,10 @@ class Store:
     def mark(self, key: str) -> Path:
         """Return the file that is there if the result with this key is in the data set."""
         return self.folder / 'done' / key[:2] / key
+
+    def place(self, recording: str) -> Path:
+        """Return the file with the folder of the sensor that has this recording."""
+        return self.mark(blake2b(recording.encode(), digest_size=16).hexdigest())
 
 
 def write_parquet(path: Path, rows: list[Row], columns: pa.Schema) -> None:
@@ -417,9 +438,9 @@ def drift_of(history: History, changes: Mapping[int, bool | None] = {}) -> Row |
 
 
 def write_sensors(store: Store, rows: Sequence[Row]) -> list[Row]:
-    """Add or replace the rows of sensors, and return the rows of all of them."""
+    """Add or replace the rows of sensors, and return the rows of all that have a recording."""
     path = store.folder / SENSORS
     known = {row['sensor']: row for row in (*read_parquet(path), *rows)}
-    found = [known[name] for name in sorted(known)]
+    found = [known[name] for name in sorted(known) if known[name]['recordings']]
     write_parquet(path, found, sensors_schema())
     return found

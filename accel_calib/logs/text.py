@@ -296,8 +296,10 @@ def _about(path: Path, head: Sequence[str]) -> dict[str, Any]:
     for line in head:
         name, colon, text = line[1:].partition(':')
         if line[0] == '#' and colon and name.strip() in ABOUT:
+            text = text.strip()
             with suppress(TypeError, ValueError):  # an ordinary comment
-                value = read_json(text)
+                bare = text in UNIT_NAMES or ('sensor' in name and text[:1] != '"')
+                value = text if bare else read_json(text)
                 about[name.strip()] = Autopilot(**value) if 'autopilot' in name else (
                     '' if value is None else str(value))
     if about.get('units', '') not in ('', *UNIT_NAMES):

@@ -152,7 +152,7 @@ _STYLE: Any = {
     'axes.spines.right': False, 'axes.axisbelow': True, 'text.color': INK, 'xtick.color': INK,
     'ytick.color': INK, 'xtick.labelsize': 9.0, 'ytick.labelsize': 9.0, 'legend.frameon': False,
     'legend.fontsize': 9.0, 'grid.color': _GRID, 'svg.fonttype': 'none',
-    'svg.hashsalt': 'accel_calib', 'axes.unicode_minus': True,
+    'svg.hashsalt': 'accel_calib', 'axes.unicode_minus': True, 'axes.formatter.limits': (-3, 5),
 }
 
 

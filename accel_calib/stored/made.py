@@ -214,8 +214,9 @@ def losses_of(calibration: Calibration, label: str, make: Callable[[Calibration]
 
     found, total = list[Loss](), difference_mg(calibration, made)
     if total >= LEAST_LOSS_MG:
-        ideal = left({})
-        found.append(Loss('', f'{label} has no sensitivity: leaves {ideal:.2g} mg', ideal))
+        ideal, step = left({}), made.rounded.get('gain')
+        words = f'rounds the sensitivity to {step}' if step else 'has no sensitivity'
+        found.append(Loss('', f'{label} {words}: leaves {ideal:.2g} mg', ideal))
         for name, values in calibration.model.values.items():
             part = float(np.sqrt(max(left({name: values}) ** 2 - ideal ** 2, 0.0)))
             effect = entry_of(name)
