@@ -18,8 +18,8 @@ from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Poses
 from driven import Driver, RATE
 from inside import (
-    LARGEST_NUMBER_OF_STEPS, Model, poses_changed, rotation_from_rpy, SensorStore,
-    spread_directions, store_of, StreamStatistics, use_calibration)
+    LARGEST_NUMBER_OF_STEPS, Model, rotation_from_rpy, SensorStore, spread_directions, store_of,
+    StreamStatistics, use_calibration)
 import numpy as np
 import pytest
 from shared import GRAVITY, python, Readings, ROOT, rows_of, Stored, table, with_effects
@@ -170,20 +170,6 @@ def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
     assert {path.stem for path in home.glob('*.yaml')} == {'imu.data_raw@imu_link'}
 
 
-def test_nothing_is_captured_from_a_sensor_that_fell_silent(stored: Stored, readings: Readings
-                                                            ) -> None:
-    driver = Driver(calibration_file=str(stored()))
-    rest = readings([UP], dwell=6.0)
-    driver.refuses('no Imu message', 'capture_pose', 'set_level')
-    driver.feed(rest[:150])
-    driver.now += 6.0
-    driver.refuses('6.0 s ago', 'capture_pose', 'set_level')
-    driver.feed(rest[150:160])
-    assert driver.ask('capture_pose').startswith('1 pose:')
-    driver.ask('set_level')
-    assert driver.calibration.is_levelled
-
-
 def test_levelling_between_two_messages_imports_no_large_library(stored: Stored) -> None:
     code = ('import sys; from driven import Driver, GRAVITY; import numpy as np; '
             'driver = Driver(calibration_file=sys.argv[1]); '
@@ -199,30 +185,6 @@ def test_levelling_between_two_messages_imports_no_large_library(stored: Stored)
 def captured(driver: Driver) -> list[list[int]]:
     """Return the directions of the captured poses."""
     return np.round(driver.poses.reading / GRAVITY).astype(int).tolist()
-
-
-def test_nothing_of_a_rest_before_a_silence_is_used_after_it(readings: Readings) -> None:
-    driver = Driver()
-    driver.feed(readings([UP], dwell=3.0))
-    driver.now, driver.stamp = driver.now + 2.3, driver.stamp + 2.3
-    driver.feed(np.tile([GRAVITY, 0.0, 0.0], (5, 1)))
-    driver.refuses('still', 'capture_pose', 'set_level')
-    assert 'jumped' not in driver.logged('warning')  # the stamps are as late as the messages
-
-
-@pytest.mark.parametrize('jump', [-3600.0, 86400.0, None])
-def test_a_jump_of_the_clock_is_logged_and_no_pose_counts_twice(
-        jump: float | None, readings: Readings) -> None:
-    driver = Driver()
-    driver.stamp = 10_000.0
-    turned = readings([UP, LEFT, FORWARD, UP], dwell=2.5)
-    for _ in range(3):
-        driver.feed(turned)
-        driver.stamp = 10_000.0 if jump is None else driver.stamp + jump  # a recording in a loop
-    assert captured(driver) == [UP, LEFT, FORWARD]
-    assert driver.logged('warning').count('jumped') == 1  # of two within a minute
-    assert len(driver.sensor.live.detector.interruptions) == 2
-    assert jump or np.all(driver.poses['count'] < 2.0 * 2.5 * RATE * 1.1)
 
 
 def test_a_rest_is_not_used_while_the_stamps_stand(readings: Readings) -> None:
@@ -243,42 +205,6 @@ def test_one_absurd_first_reading_does_not_spoil_the_capture(readings: Readings)
     driver.feed([[0.0, 0.0, 1e200]])
     driver.feed(readings([UP, LEFT], dwell=2.5))
     assert captured(driver) == [UP, LEFT]
-
-
-def test_a_level_pose_that_contradicts_the_given_mounting_is_refused(
-        stored: Stored, readings: Readings) -> None:
-    driver = Driver(calibration_file=str(stored()), mounting_rpy=[0.5, 0.0, 0.0])
-    driver.feed(readings([UP], dwell=6.0)[:200])
-    driver.refuses('10° of tilt', 'set_level')
-
-
-@pytest.mark.parametrize(('old', 'new'), [
-    ('version: 3', 'version: 999'), ('readings: m/s2', 'readings: native'),
-    ('sensor: imu_link', 'sensor: another')])
-def test_a_load_that_is_refused_keeps_the_calibration_in_use(
-        old: str, new: str, stored: Stored, readings: Readings) -> None:
-    path = stored(sensor='imu_link')
-    driver = Driver(calibration_file=str(path))
-    driver.feed(readings([UP])[:30])
-    used = driver.calibration
-    path.write_text(path.read_text().replace(old, new, 1))
-    with pytest.raises(StoredCalibrationError, match=new.split(': ')[1]):
-        driver.ask('load')
-    assert driver.calibration is used is not None
-
-
-def test_reset_removes_poses_and_calibration_but_keeps_the_files(
-        home: Path, readings: Readings) -> None:
-    driver = Driver(sensor='arm')
-    driver.feed(readings(spread_directions(12)))
-    driver.ask('fit')
-    stored = (home / 'arm.yaml').read_bytes()
-    driver.ask('reset')
-    assert driver.calibration is None
-    assert captured(driver) == []
-    assert not {'arm.yaml', 'arm_poses.csv'} & {path.name for path in home.iterdir()}
-    assert (home / 'arm.yaml.reset1').read_bytes() == stored
-    assert len(read_poses(home / 'arm_poses.csv.reset1')) == 12
 
 
 # Guidance
@@ -312,21 +238,6 @@ def test_findings_are_logged_by_their_level(stored: Stored) -> None:
 
 
 # Automatic fits
-
-
-def test_automatic_fits_wait_a_minute_and_keep_a_calibration_that_agrees(
-        home: Path, readings: Readings) -> None:
-    driver = Driver(auto_fit=True)
-    driver.feed(readings(spread_directions(12)))
-    first = driver.calibration
-    assert first is not None
-    driver.feed(readings(spread_directions(31)[:8]))
-    driver.tick(60.0)
-    assert driver.sensor.fitted_poses > 12  # a fit has been made, and agrees
-    assert driver.calibration is first
-    poses_changed(driver.session, ended=False)
-    assert not driver.sensor.auto_fit_waits  # the same poses
-    assert len(list(home.glob('*.before*'))) == 1
 
 
 def test_a_refined_calibration_is_not_replaced_by_an_automatic_fit(readings: Readings) -> None:
@@ -444,18 +355,6 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
 def put(driver: Driver, readings: Readings, up: Any) -> None:
     """Let the robot rest with this direction of up, in its own frame."""
     driver.feed(readings([MOUNTING @ up], dwell=6.0)[:200])
-
-
-def test_the_heading_needs_a_level_mounting_and_the_nose_down(
-        stored: Stored, readings: Readings) -> None:
-    driver = Driver(calibration_file=str(stored()))
-    put(driver, readings, UP)
-    driver.refuses('not levelled', 'set_heading')
-    driver.ask('set_level')
-    driver.refuses('within 10° of the flat pose', 'set_heading')
-    put(driver, readings, NOSE_DOWN)
-    driver.ask('set_heading')
-    np.testing.assert_allclose(driver.session.state.applied.rotation, MOUNTING, atol=0.01)
 
 
 @pytest.mark.parametrize(('frame', 'axes'), [
@@ -588,3 +487,20 @@ def test_a_rest_that_is_no_pose_is_said_with_its_reason(readings: Readings) -> N
     driver.ask('undo_pose')
     driver.ask('refine')
     assert has(driver.calibration.noted, 'missing')
+
+
+def test_without_a_thermometer_the_middle_of_the_range_corrects_and_is_said(
+        stored: Stored, readings: Readings) -> None:
+    path = stored(sensor='imu_link')
+    calibration = with_effects(
+        read_calibration(path), {'offset_temperature': [0.01, -0.015, 0.02]}, 1e-14,
+        temperature=np.linspace(20.0, 40.0, 20))
+    write_calibration(path, calibration)
+    driver, reading = Driver(calibration_file=str(path)), readings([[0.0, 0.6, 0.8]])
+    driver.feed(reading)
+    driver.tick(31.0)
+    found = np.array(driver.sensor.force_of(tuple(reading[0]), driver.session.state.context))
+    expected = calibration.apply(reading[:1], temperature=[30.0])[0]
+    np.testing.assert_allclose(found * GRAVITY, expected, atol=1e-6)
+    assert 'no temperature arrives' in driver.finding('stream').words
+    assert driver.finding('stream').level == 'USABLE'
