@@ -242,16 +242,6 @@ def test_bytes_are_corrected_as_numbers_are(effects, turned):
     assert published > COUNT // 16
 
 
-@pytest.mark.parametrize('turned', [False, True])
-@pytest.mark.parametrize('part', COVARIANCES)
-def test_a_covariance_that_is_not_finite_becomes_unknown(part, turned):
-    doubles = np.zeros(37)
-    doubles[ACCELERATION], doubles[part.start + 4] = (0.0, 0.0, STANDARD_GRAVITY), math.nan
-    data = message(doubles)
-    found = rewriter_of(data, calibration_of({}, turned=turned))(data, {'temperature': 25.0})
-    np.testing.assert_array_equal(doubles_of(found)[part], 0.0)
-
-
 OTHERS = [name for name, effect in EFFECTS.items() if not effect.linear]
 KNOWN = {'temperature': 31.0, 'supply_voltage': 3.1, 'time': 4000.0, 'rate': (1.0, -2.0, 0.5),
          'std': (0.01, 0.02, 0.03), 'previous': (0.0, 0.6, -0.8)}

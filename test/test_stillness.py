@@ -11,7 +11,7 @@ from accel_calib.stillness import (
     capture, Captured, CaptureSettings, poses_from, select, StillDetector)
 from accel_calib.units import units_of
 from inside import (
-    excess_of_means, lines, long_run, Model, oscillation, repeated_extremes, simulate_recording)
+    excess_of_means, long_run, Model, oscillation, repeated_extremes, simulate_recording)
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
@@ -317,18 +317,6 @@ def test_a_dwell_that_is_not_still_according_to_later_ones_is_doubtful():
     start, = (each.start for each in pushed(rows(
         np.arange(len(reading)) / 100.0, reading)).judged() if each.reason)
     assert start < 1.0
-
-
-def test_lines_through_series_are_those_of_least_squares():
-    values = np.random.default_rng(4).normal(size=(3, 12))
-    line = lines(values, 12)
-    time = np.arange(12)
-    fitted = np.polyfit(time, values.T, 1)
-    left = values.T - np.outer(time, fitted[0]) - fitted[1]
-    np.testing.assert_allclose(line.slope[:, 0], fitted[0])
-    np.testing.assert_allclose(line.square[:, 0], np.sum(left ** 2, axis=0))
-    np.testing.assert_allclose(line.neighbours[:, 0], np.sum(left[1:] * left[:-1], axis=0))
-    np.testing.assert_allclose(line.time_square, np.sum((time - time.mean()) ** 2))
 
 
 def test_correlations_at_lags_of_half_a_series_and_more_are_not_used():
