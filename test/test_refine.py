@@ -123,17 +123,21 @@ def test_a_relaxation_after_turns_is_named_with_its_time_constant(lasting):
     assert ac.verify(tables[1], found.calibration).rms_after_mg < 0.5
 
 
+def stepped(seed, true, step=1.0, warming=lambda t: 12.0 * t):
+    """Return 60 poses of a board that warms up beside a thermometer with steps [°C]."""
+    share = np.sort(np.random.default_rng(seed).uniform(size=60))
+    temperature = 20.3 + warming(share)
+    poses = ac.simulate({**SENSOR, 'offset_temperature': true}, poses=60, seed=seed,
+                        time=3600.0 * share, temperature=temperature)
+    return poses.with_columns(temperature=step * np.round(temperature / step))
+
+
 @pytest.mark.parametrize(('warming', 'step'), [
     (lambda t: 12.0 * t, 0.5), (lambda t: 12.0 * t, 1.0),
     (lambda t: 16.0 - 16.0 * np.exp(-3.0 * t), 0.5)])
 @pytest.mark.parametrize('seed', range(2))
 def test_a_thermometer_with_steps_beside_a_ramp_does_not_hide_the_cause(seed, step, warming):
-    share = np.sort(np.random.default_rng(seed).uniform(size=60))
-    temperature = 20.3 + warming(share)
-    poses = ac.simulate({**SENSOR, 'offset_temperature': [2e-3, -1e-3, 1e-3]}, poses=60, seed=seed,
-                        time=3600.0 * share, temperature=temperature)
-    stepped = poses.with_columns(temperature=step * np.round(temperature / step))
-    found = ac.refine(stepped, base='10')
+    found = ac.refine(stepped(seed, [2e-3, -1e-3, 1e-3], step, warming), base='10')
     only, = found.steps
     assert found.verdict == 'explained'
     assert 'offset_temperature' in (only.effect, *only.rivals)
@@ -144,11 +148,7 @@ def test_intervals_beside_a_thermometer_with_steps_contain_the_truth():
     """The errors of neighbouring poses are alike: they do not average out."""
     true, away = np.array([16e-3, -8e-3, 8e-3]), []
     for seed in range(6):
-        share = np.sort(np.random.default_rng(seed).uniform(size=60))
-        temperature = 20.3 + 12.0 * share
-        poses = ac.simulate({**SENSOR, 'offset_temperature': true}, poses=60, seed=seed,
-                            time=3600.0 * share, temperature=temperature)
-        step, = ac.refine(poses.with_columns(temperature=np.round(temperature)), base='10').steps
+        step, = ac.refine(stepped(seed, true), base='10').steps
         if step.effect == 'offset_temperature':  # else a drift, which explains a ramp as well
             away += [(step.parameters[axis] - each) / step.parameters_sd[axis]
                      for axis, each in zip('xyz', true)]
