@@ -99,11 +99,7 @@ def test_with_a_mounting_all_fields_are_in_one_frame(levelled):
     after = Rotation.from_quat(found[:, ORIENTATION])
     np.testing.assert_allclose(after.apply(found[:, ANGULAR_VELOCITY]),
                                before.apply(fields[:, ANGULAR_VELOCITY]))
-
-
-def test_a_known_covariance_is_transformed_and_grows_by_that_of_the_calibration(levelled):
-    fields = fields_of()
-    found = corrected(levelled, fields)
+    # A known covariance is transformed, and grows by that of the calibration.
     inverse = levelled.model.rotation.T @ np.linalg.inv(levelled.gain)
     own = inverse @ fields[:, ACCELERATION_COVARIANCE].reshape(-1, 3, 3) @ inverse.T
     added = found[:, ACCELERATION_COVARIANCE].reshape(-1, 3, 3) - own

@@ -22,12 +22,11 @@ from accel_calib.messages import OneReading
 from accel_calib.report import refinement_page
 from accel_calib.table import Recording
 from faults.sample import sample
-from inside import COMMAND, Correction
+from inside import Correction
 import numpy as np
 import pandas as pd
 import pytest
-from shared import (
-    OWN, python, random_directions, refused, run, run_json, run_snippets, SENSOR, table)
+from shared import OWN, python, random_directions, refused, run, run_snippets, SENSOR, table
 
 DOCS = Path(__file__).parent.parent / 'docs' / 'effects.md'
 
@@ -140,35 +139,6 @@ def test_text_and_columns_with_holes_are_no_cause(tmp_path):
     poses['humidity'] = [*rng.uniform(30.0, 50.0, 29), np.nan]
     poses.to_csv(tmp_path / 'poses.csv', index=False)
     assert ac.read_poses(tmp_path / 'poses.csv').quantities == ('pressure',)
-
-
-def test_an_own_effect_is_simulated_named_stored_and_needed(tmp_path, capsys):
-    own, poses, stored = (tmp_path / name for name in ('own.py', 'poses.csv', 'calibration.yaml'))
-    own.write_text(OWN)
-    assert run('simulate', '-o', poses, '--poses', 60, '--units', 'g', '--also', own,
-               '--effect', 'dead_band=0.01,-0.008,0.006', '--effect', 'offset=0.02,-0.01,0.03',
-               '--effect', 'axis_gain=0.01') == 0
-    capsys.readouterr()
-    status, found = run_json(capsys, 'refine', poses, '--also', own, '-o', stored)
-    step, = found['steps']
-    assert (status, step['effect']) == (0, 'dead_band')
-    np.testing.assert_allclose([step['parameters'][axis] for axis in AXES],
-                               [0.01, -0.008, 0.006], atol=1e-3)
-    without = run_json(capsys, 'refine', poses)[1]  # in the same process
-    assert 'dead_band' not in [step['effect'] for step in without['steps']]
-
-    def verified(*more):
-        done = python(*COMMAND, 'verify', poses, '-c', stored, *more)
-        return done.returncode, done.stderr.splitlines()
-
-    status, (line,) = verified()
-    assert (status, '--also FILE.py' in line) == (2, True)
-    assert verified('--also', own) == (0, [])
-    capsys.readouterr()
-    assert run('compare', stored, stored, '--also', own) == 0
-    own.write_text(OWN.replace('0.05', '0.06'))
-    status, (line,) = verified('--also', own)
-    assert (status, 'another definition' in line) == (2, True)
 
 
 @pytest.mark.parametrize(('wrong', 'message'), [

@@ -4,7 +4,6 @@
 """Noise figures from a long rest, by Allan deviation."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 import json
 from pathlib import Path
 import re
@@ -18,11 +17,10 @@ from accel_calib.noise import noise_of, NoiseFigures, to_json
 from accel_calib.table import Floats, Recording
 from accel_calib.units import STANDARD_GRAVITY
 from inside import (
-    ALLAN_COMPONENTS, allan_variances, fit_components, longest_rest, octaves, shares,
-    spread_directions, spread_of)
+    ALLAN_COMPONENTS, allan_variances, fit_components, longest_rest, octaves, shares, spread_of)
 import numpy as np
 import pytest
-from shared import changed, G, poses_of, run, run_json, samples_of
+from shared import changed, G, run, samples_of
 
 allantools = pytest.importorskip('allantools')
 
@@ -265,23 +263,6 @@ def test_a_rest_is_rated(white: float, kind: str) -> None:
     found = {each.kind for each in rating.findings}
     assert kind in found
     assert ('noisy' in found) is (kind == 'noisy')
-
-
-def test_a_calibration_turns_counts_into_g(
-        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rng = np.random.default_rng(21)
-    directions = spread_directions(24)
-    readings = directions * 16384.0 + [100.0, -50.0, 20.0] + rng.normal(size=(24, 3))
-    write_table(tmp_path / 'poses.csv', poses_of(
-        readings, 'native', std=np.full((24, 3), 10.0), count=np.full(24, 100.0)))
-    rest = resting(22, 6000)
-    counts = replace(rest.with_columns(reading=rest.reading * 16384.0 + 20.0), units='native')
-    write_table(tmp_path / 'rest.csv', counts)
-    assert run('fit', tmp_path / 'poses.csv', '-o', tmp_path / 'c.yaml') == 0
-    capsys.readouterr()
-    status, made = run_json(capsys, 'noise', tmp_path / 'rest.csv', '-c', tmp_path / 'c.yaml')
-    assert status == 0
-    assert made['accelerometer_noise_density'] == pytest.approx(1e-4 * STANDARD_GRAVITY, rel=0.05)
 
 
 def test_the_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,30 +3,15 @@
 
 """Plans of poses that separate a named effect from its rivals."""
 
-import csv
 from dataclasses import replace
 
 from accel_calib.calibration import NextPose, PlannedPose, SessionPlan
 from accel_calib.findings import rival_words
 from accel_calib.refinement import refine
-from generator import Setup, simulate, write_csv
 from inside import choose_levels, Guide, model_with, simulate_poses, step_of
 import numpy as np
 import pytest
-from shared import G, poses_of, random_directions, run_json
-
-
-def read_plan(path):
-    """Return the poses of a plan, one mapping of column to text each."""
-    lines = path.read_text().splitlines()
-    return list(csv.DictReader(line for line in lines if not line.startswith('#')))
-
-
-def table(path, hidden, *, size, seed, temperature='wandering'):
-    made = simulate(np.random.default_rng(seed), {hidden: size},
-                    Setup(poses=24, rates='small', temperature=temperature))
-    write_csv(path, made.columns)
-    return path
+from shared import G, poses_of, random_directions
 
 
 def simulated(rng, up=None, *, noise_g, context=None, **effects):
@@ -35,20 +20,6 @@ def simulated(rng, up=None, *, noise_g, context=None, **effects):
                         **{name: np.array(values) for name, values in effects.items()}})
     return simulate_poses(model, random_directions(24, rng) if up is None else up, rng,
                           noise_g=noise_g, context=context)
-
-
-def test_temperature_and_drift_are_separated_at_other_temperatures(tmp_path, capsys):
-    path, rivals = tmp_path / 'plan.csv', table(
-        tmp_path / 'rivals.csv', 'offset_temperature', size=2, seed=[0, 2], temperature='rising')
-    status, _ = run_json(capsys, 'refine', rivals, '--plan', path)
-    poses = read_plan(path)
-    assert status == 0
-    pair = {'offset_temperature', 'offset_drift'}
-    assert all(pair <= set(pose['separates'].split(' / ')) for pose in poses)
-    assert all(-20.0 <= float(pose['temperature']) <= 70.0 for pose in poses)
-    assert float(poses[-1]['expected_probability']) > 0.9
-    waits = [float(pose['wait']) for pose in poses]
-    assert waits == sorted(waits)
 
 
 def test_voltages_of_a_plan_are_the_ends_and_the_middle_of_those_of_the_poses():

@@ -174,7 +174,7 @@ def test_messages_in_another_encoding_are_corrected_and_unusable_ones_dropped_an
 # An effect that the calibration lacks is found and corrected
 
 
-POSES = 26
+POSES = 18
 MOVES = np.array([0.002, -0.0015, 0.001])
 """Offset per ampere [g]."""
 

@@ -11,11 +11,10 @@ from typing import Any
 from accel_calib.calibration import level, set_heading
 from accel_calib.effects import Covariate
 from accel_calib.errors import InputError, StoredCalibrationError
-from accel_calib.finding import Finding, has, LEVELS
-from accel_calib.logs import open_log, read_poses, write_table
+from accel_calib.finding import Finding, LEVELS
+from accel_calib.logs import open_log, read_poses
 from accel_calib.session import CalibratorSettings, changed, next_step, progress, Surroundings
 from accel_calib.stored import read_calibration, write_calibration
-from accel_calib.table import Poses
 from driven import Driver, RATE
 from inside import (
     LARGEST_NUMBER_OF_STEPS, Model, rotation_from_rpy, SensorStore, spread_directions, store_of,
@@ -85,34 +84,6 @@ def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
     assert second.finding('calibration').level == 'GOOD'
 
 
-def test_files_that_cannot_be_used_are_never_overwritten(tmp_path: Path, stored: Stored,
-                                                         readings: Readings) -> None:
-    other = stored('use.yaml', sensor='another').read_text()
-    table = 'ax,ay,az\n1,2,words\n'
-    (tmp_path / 'use_poses.csv').write_text(table)
-    (tmp_path / '.use.yaml.12345.tmp').write_text('of a process that was killed')
-    driver = Driver(calibration_file=str(tmp_path / 'use.yaml'))
-    driver.feed(readings(spread_directions(12)))
-    assert driver.finding('calibration').level == 'BAD'
-    assert (tmp_path / 'use.yaml').read_text() == other
-    assert (tmp_path / 'use_poses.csv.damaged1').read_text() == table
-    assert not (tmp_path / '.use.yaml.12345.tmp').exists()
-    assert driver.ask('fit')
-    assert (tmp_path / 'use.yaml.other1').read_text() == other
-    assert read_calibration(tmp_path / 'use.yaml').sensor == 'imu_link'
-    assert len(read_poses(tmp_path / 'use_poses.csv')) == 12
-
-
-@pytest.mark.parametrize('changes', [{'sensor': 'another'}, {'units': 'g'}])
-def test_poses_of_another_sensor_or_unit_are_renamed(changes: Any) -> None:
-    store = store_of(CalibratorSettings(sensor='arm'), 'arm', '/imu')
-    store.save_poses(Poses({'reading': np.array([[0.1, 0.2, 9.8]])}, np.array([1])))
-    write_table(store.poses, replace(read_poses(store.poses), **changes))
-    driver = Driver(sensor='arm')
-    assert len(driver.poses) == 0
-    assert 'arm_poses.csv.damaged1' in driver.logged()
-
-
 def test_calibration_in_g_corrects_messages_in_m_s2(stored: Stored) -> None:
     path, reading = stored(unit='g'), np.array([[1.0, -2.0, 9.0]])
     loaded = Driver(calibration_file=str(path)).calibration
@@ -120,18 +91,6 @@ def test_calibration_in_g_corrects_messages_in_m_s2(stored: Stored) -> None:
     np.testing.assert_allclose(
         loaded.correct(reading), read_calibration(path).correct(reading / GRAVITY) * GRAVITY,
         rtol=1e-14)
-
-
-def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readings) -> None:
-    driver = Driver()
-    rest = readings([UP], dwell=6.0)
-    driver.feed(rest[:100])
-    assert driver.sensor.live.detector.still
-    assert driver.feed(rest[:1], 'another') == 0
-    assert not driver.sensor.live.detector.still
-    assert driver.feed(rest[100:]) == len(rest) - 100
-    assert driver.session.state.statistics.dropped['foreign'] == 1
-    assert driver.finding('stream').level == 'USABLE'
 
 
 @pytest.mark.parametrize(('units', 'per_g'), [('native', 16384.0), ('m/s2', 9.80665)])
@@ -472,21 +431,6 @@ def test_a_start_without_a_column_leaves_it_in_the_stored_poses(
             with open_log(driver.session.state.files.store.poses) as log:  # as a command reads it
                 assert column not in log.poses
                 assert [column in note for note in log.notes] == [True]
-
-
-def test_a_rest_that_is_no_pose_is_said_with_its_reason(readings: Readings) -> None:
-    driver = Driver(min_dwell=1.5)
-    driver.feed(readings(spread_directions(4)))
-    driver.feed(readings(spread_directions(9)[6:], dwell=1.0))
-    assert [line.words for line in driver.log if 'gave no pose' in line.words] == [
-        'this rest gave no pose: shorter than min_dwell']
-    driver.feed(np.zeros((150, 3)))
-    driver.feed(readings(spread_directions(12)))
-    driver.ask('fit')
-    assert has(driver.calibration.noted, 'missing')
-    driver.ask('undo_pose')
-    driver.ask('refine')
-    assert has(driver.calibration.noted, 'missing')
 
 
 def test_without_a_thermometer_the_middle_of_the_range_corrects_and_is_said(

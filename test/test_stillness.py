@@ -387,14 +387,6 @@ def test_a_doubtful_pose_does_not_take_the_place_of_a_sure_one(repeated):
     assert kept[6] is dwells[6]
 
 
-def test_merged_poses_lie_on_the_sphere_and_are_less_noisy():
-    kept, poses = (captured(*visited(AGAIN), settings=CaptureSettings(repeated=repeated)).poses
-                   for repeated in ('keep', 'merge'))
-    assert np.linalg.norm(poses.reading[0]) == pytest.approx(1.0, abs=4e-4)
-    assert poses.reading[0, 0] == pytest.approx(0.015, abs=1e-3)
-    assert np.all(poses.noise[:2] < kept.noise[:2])
-
-
 def test_a_number_that_is_not_finite_is_refused_with_its_row():
     time, reading = visited(FACES)
     reading = reading.copy()

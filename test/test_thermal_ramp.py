@@ -31,7 +31,7 @@ import numpy as np
 import pytest
 from ramps import BENT, G, LINE, offset_at, ramp, twelve_poses, TWISTED, UP, warming, write_ulog
 from scipy.signal import medfilt
-from shared import data, MPS2, refused, rms, run, run_json
+from shared import MPS2, refused, rms, run, run_json
 from test_exports import qgroundcontrol
 from test_log_formats import make
 
@@ -244,8 +244,3 @@ def test_the_error_on_a_second_ramp_is_not_larger_than_that_of_the_autopilots(tr
                        for offset in offsets])
     ours, *theirs = np.mean(errors, axis=0)
     assert ours <= 1.02 * min(theirs)
-
-
-def test_a_log_in_which_the_board_moved_is_refused(tmp_path, capsys):
-    path = data('sensehat_lsm9ds1_temperature.csv')
-    assert 'the board moved' in refused(capsys, 'thermal', path, '-o', tmp_path / 'd.yaml')

@@ -70,8 +70,9 @@ class _Driver(Driver):
         path.write_text(path.read_text(encoding='utf-8').replace(old, new, 1), encoding='utf-8')
 
     def kept(self) -> Any:
-        """Return the files, and the directions of the captured poses."""
-        return [sorted(map(str, Path().iterdir())), np.round(self.poses.reading / G, 1)]
+        """Return the files, the directions of the poses, and the findings of the calibration."""
+        noted = [] if self.calibration is None else [each.kind for each in self.calibration.noted]
+        return [sorted(map(str, Path().iterdir())), np.round(self.poses.reading / G, 1), noted]
 
     def state(self) -> Any:
         """Return progress, diagnostics, checks and poses."""
