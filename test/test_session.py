@@ -311,37 +311,6 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
 # Frames
 
 
-def put(driver: Driver, readings: Readings, up: Any) -> None:
-    """Let the robot rest with this direction of up, in its own frame."""
-    driver.feed(readings([MOUNTING @ up], dwell=6.0)[:200])
-
-
-@pytest.mark.parametrize(('frame', 'axes'), [
-    ('ros', np.eye(3)), ('ned', np.diag([1.0, -1.0, -1.0])),
-    ('android', [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])])
-def test_messages_are_specific_force_in_every_frame_also_after_a_restart_with_another(
-        stored: Stored, readings: Readings, frame: str, axes: Any) -> None:
-    path = stored()
-    for before in ('ros', frame):
-        driver = Driver(calibration_file=str(path), frame=before)
-        for up, command in ((UP, 'set_level'), (NOSE_DOWN, 'set_heading')):
-            put(driver, readings, up)
-            driver.ask(command)
-        driver.session.close()
-    for after in ('ros', frame):
-        driver = Driver(calibration_file=str(path), frame=after)
-        expected = MOUNTING @ (np.eye(3) if after == 'ros' else axes)
-        np.testing.assert_allclose(driver.session.state.applied.rotation, expected, atol=0.01)
-        put(driver, readings, UP)
-        gravity = driver.session.state.gravity / GRAVITY
-        np.testing.assert_allclose(gravity, np.array(expected).T @ MOUNTING @ UP, atol=0.01)
-        assert gravity[2] * (-1.0 if after == 'ned' else 1.0) > 0.99
-        driver.ask('set_level')
-        np.testing.assert_allclose(driver.session.state.applied.rotation, expected, atol=0.01)
-        assert ('it is turned' in driver.logged('warning')) is (frame == 'android')
-        driver.session.close()
-
-
 @pytest.mark.parametrize('frame', ['ned', 'win8'])
 def test_a_stored_mounting_of_the_documents_is_turned_before_it_is_used(
         stored: Stored, frame: Any) -> None:

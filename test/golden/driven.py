@@ -74,6 +74,11 @@ class _Driver(Driver):
         noted = [] if self.calibration is None else [each.kind for each in self.calibration.noted]
         return [sorted(map(str, Path().iterdir())), np.round(self.poses.reading / G, 1), noted]
 
+    def frame(self) -> Any:
+        """Return the rotation that is applied to messages, and the gravity in them."""
+        return {'rotation': self.session.state.applied.rotation,
+                'gravity': self.session.state.gravity / G}
+
     def state(self) -> Any:
         """Return progress, diagnostics, checks and poses."""
         drift = self.session.sensor.drift
