@@ -6,7 +6,6 @@
 from dataclasses import replace
 
 from accel_calib.errors import InputError
-from accel_calib.logs import read_recording
 from accel_calib.stillness import (
     capture, Captured, CaptureSettings, poses_from, select, StillDetector)
 from accel_calib.units import units_of
@@ -16,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation, Slerp
-from shared import data, G, NATIVE, rows_of as rows, samples_of, table
+from shared import G, NATIVE, rows_of as rows, samples_of, table
 
 
 def still(seed, seconds, rate=100.0, noise=2e-3):
@@ -349,20 +348,6 @@ def visited(directions):
     """Return times and readings of a sensor that is turned to these directions."""
     found = simulate_recording(Model({}), np.array(directions, float), np.random.default_rng(0))
     return found['time'], found.reading
-
-
-def test_a_sensor_that_lay_still_for_days_has_one_pose_per_orientation_unless_split():
-    samples = read_recording(data('sensehat_lsm9ds1_temperature.csv'))
-    result = capture(samples, G)
-    assert 3 <= len(result.poses) <= 5
-    assert result.samples > 24000
-    assert [each.kind for each in result.interruptions] == ['gap']
-    assert 'orientation' not in result.poses
-    poses = capture(samples, G, CaptureSettings(max_dwell=3600)).poses
-    assert 60 < len(poses) < 80
-    assert np.bincount(poses['orientation']).max() == pytest.approx(58, abs=1)
-    assert np.ptp(poses['temperature']) > 1.0
-    assert np.all(np.diff(poses['time']) > 0.0)
 
 
 FACES = [(0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, -1), (0, -1, 0), (-1, 0, 0)]
