@@ -130,7 +130,7 @@ def compare(frame: Frame, sets: int = 200, seed: int = 1) -> Iterator[str]:
     lines: list[Line] = []
     for index, case in enumerate(CASES):
         count = max(sets // 2 if case.runs > 5 else sets, 1)
-        lines += lines_of(case, frame.run(compare_set, [(index, seed, k) for k in range(count)]))
+        lines += lines_of(case, frame.run_sets(compare_set, count, index, seed))
     yield table(lines)
 
 

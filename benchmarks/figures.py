@@ -103,6 +103,11 @@ class Frame:
         tell(f'{work.__name__}: {len(tasks)} sets in {time.monotonic() - began:.0f} s')
         return found
 
+    def run_sets(self, work: Callable[..., Any], sets: int, *given: Any, first: int = 0
+                 ) -> list[Any]:
+        """Return the results of a function for arguments and the number of each set."""
+        return self.run(work, [(*given, first + number) for number in range(sets)])
+
 
 @dataclass(frozen=True)
 class Measured:

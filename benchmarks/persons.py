@@ -69,8 +69,7 @@ def is_told(kind: int, seed: int, number: int) -> bool:
 def persons(frame: Frame, sets: int = 40, seed: int = 1) -> Iterator[str]:
     rows = []
     for name, case in test_persons.PERSONS.items():
-        ended, seconds, held = np.array(frame.run(
-            run_person, [(name, seed, number) for number in range(sets)]), float).T
+        ended, seconds, held = np.array(frame.run_sets(run_person, sets, name, seed), float).T
         known = held[np.isfinite(held)]
         words = case.ends if case.ends == 'done' else f'{case.ends}: {case.named or "refused"}'
         rows.append((name, words, f'{np.sum(ended):.0f} of {sets}', f'{case.seconds:.0f}',

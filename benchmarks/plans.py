@@ -163,8 +163,7 @@ def plans(frame: Frame, sets: int = 12, seed: int = 1) -> Iterator[str]:
     for index, (first, second, *_) in enumerate(TWINS):
         outcomes: list[Outcome] = []
         for start in range(0, TRIES, sets):
-            tried = frame.run(run_set, [(index, seed, start + k) for k in range(sets)])
-            outcomes += filter(None, tried)
+            outcomes += filter(None, frame.run_sets(run_set, sets, index, seed, first=start))
             if len(outcomes) >= sets:
                 break
         lines += lines_of(f'{first} and {second}', outcomes[:sets]) if outcomes else []

@@ -252,7 +252,7 @@ def take(name: str, seed: int, number: int) -> tuple[list[float], float]:
 def next_pose(frame: Frame, sets: int = 200, seed: int = 1) -> Iterator[str]:
     lines, needed, rows = [], {}, []
     for name, (order, _) in ORDERS.items():
-        found = frame.run(take, [(name, seed, number) for number in range(sets)])
+        found = frame.run_sets(take, sets, name, seed)
         medians = np.median([errors for errors, _ in found], axis=0)
         above = FEWEST + np.flatnonzero(~(medians <= AIM))
         needed[name] = FEWEST if len(above) == 0 else int(above[-1]) + 1

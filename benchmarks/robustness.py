@@ -17,10 +17,9 @@ from accel_calib.table import Floats, numbered, Recording
 from accel_calib.units import units_of
 from figures import Frame, Line, table
 import numpy as np
-from scipy.signal import lfilter
 from sensors import (
-    Case, draw_case, draw_sensor, knock, length_error_mg, misplace, NOISE, random_directions,
-    spread)
+    Case, draw_case, draw_noise, draw_sensor, knock, length_error_mg, misplace, NOISE,
+    random_directions, spread)
 
 G = units_of('g')
 SHOWS_MG = 2.0
@@ -102,8 +101,8 @@ def knocks(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
     asked = {(12, 0): 0.27, (36, 0): 0.148, (1000, 0): 0.029, (12, 1): 0.33, (36, 3): 0.165}
     for (count, knocked), most in asked.items():
         for measured in (True, False):
-            error, named, lost, best = map(np.array, zip(*frame.run(knocks_of, [
-                (count, knocked, measured, seed + k) for k in range(sets)])))
+            error, named, lost, best = map(np.array, zip(*frame.run_sets(
+                knocks_of, sets, count, knocked, measured, first=seed)))
             what = f'{count} poses, ' + (f'{knocked} knocked by 50 mg' if knocked else 'clean')
             what += '' if measured else ', noise not given'
             middle = float(np.median(error))
@@ -139,8 +138,7 @@ def bounds(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
     sets = 5 * sets
     for noise, counts in (('measured', (12, 36, 1000)), ('scatter', (24, 36, 100))):
         for count in counts:
-            over, stated = zip(*frame.run(bound_of, [(count, noise, seed + k)
-                                                     for k in range(sets)]))
+            over, stated = zip(*frame.run_sets(bound_of, sets, count, noise, first=seed))
             what, ratio = f'{count} poses{NOISES[noise]}', rms(np.array(over))
             yield Line(f'{what}: RMS error of the parameters over the Cramér-Rao bound',
                        f'{ratio:.3f}', sets, '≤ 1.05', ratio <= 1.05)
@@ -161,8 +159,8 @@ def placements(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
     """Yield the lines of badly placed orientations."""
     for count in (12, 18, 36):
         what = f'six faces and {count - 6} more placed'
-        (error, reported), (_, wrongly) = (map(np.array, zip(*frame.run(placement_of, [
-            (count, degrees, seed + k) for k in range(sets)]))) for degrees in (2.0, 0.0))
+        (error, reported), (_, wrongly) = (map(np.array, zip(*frame.run_sets(
+            placement_of, sets, count, degrees, first=seed))) for degrees in (2.0, 0.0))
         middle = float(np.median(error))
         yield share(f'{what} 2° off: reported', reported, 1.0)
         yield Line(f'{what} 2° off: error [mg]', f'{middle:.3f}', sets, '≤ 0.4',
@@ -201,8 +199,7 @@ def intervals(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
              for noise in ('differs', 'not given', 'understated', 'scatter')]
     rows += [('12', '12', count, 'scatter') for count in (12, 36)]
     for row in rows:
-        values, readings = zip(*frame.run(interval_of, [
-            (*row, seed + k) for k in range(10 * sets)]))
+        values, readings = zip(*frame.run_sets(interval_of, 10 * sets, *row, first=seed))
         fitted = [part for part in values if len(part)]
         each = 100.0 * np.mean(fitted, axis=0)
         corrected = 100.0 * np.mean([part for part in readings if len(part)])
@@ -218,9 +215,7 @@ def recording_of(correlation: float, seed: int) -> Floats:
     rng = np.random.default_rng([seed, int(1000 * correlation)])
     sensor = draw_sensor(rng)
     force, _, _ = path(spread(16, rng), RATE, 4.0, 1.0)
-    white = 3e-3 * rng.normal(size=force.shape)
-    kept = np.exp(-1.0 / (RATE * correlation)) if correlation else 0.0
-    noise = lfilter([np.sqrt(1.0 - kept ** 2)], [1.0, -kept], white, axis=0)
+    noise = 3e-3 * draw_noise(rng, len(force), RATE, correlation)
     columns = {'time': np.arange(len(force)) / RATE, 'reading': sensor.reading(force) + noise}
     try:
         found = fit_poses(capture(Recording(columns, numbered(columns)), G).poses, G, model='10')
@@ -233,8 +228,8 @@ def recording_of(correlation: float, seed: int) -> Floats:
 def recordings(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
     """Yield the lines of intervals from recordings whose samples are correlated."""
     for correlation in (0.0, 0.02, 0.05, 0.2):
-        inside = [part for part in frame.run(recording_of, [
-            (correlation, seed + k) for k in range(2 * sets)]) if len(part)]
+        inside = [part for part in frame.run_sets(
+            recording_of, 2 * sets, correlation, first=seed) if len(part)]
         each = 100.0 * np.mean(inside, axis=0)
         yield Line(f'recording of 16 rests of 4 s, samples correlated over {correlation:g} s: 95 '
                    '% intervals contain the truth', f'parameters {np.min(each):.1f} to '
@@ -268,7 +263,7 @@ def wiring_of(fault: str, seed: int) -> bool:
 def wiring(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
     """Yield the lines of how often faults of the wiring are reported."""
     for fault, what in FAULTS.items():
-        right = frame.run(wiring_of, [(fault, seed + k) for k in range(sets)])
+        right = frame.run_sets(wiring_of, sets, fault, first=seed)
         sound = fault == 'none'
         yield share(f'known orientations, {what}: {"nothing reported" if sound else "reported"}',
                     right, 0.99 if sound else 1.0)
@@ -287,7 +282,7 @@ def choices(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
     """Yield the lines of auto against the best fixed model."""
     for kind in ('4', '7', '10'):
         for count in (6, 8, 9, 10, 12, 18, 24, 36, 60):
-            found = frame.run(choice_of, [(kind, count, seed + k) for k in range(2 * sets)])
+            found = frame.run_sets(choice_of, 2 * sets, kind, count, first=seed)
             median = {name: float(np.median([one[name] for one in found])) for name in found[0]}
             best = min(('4', '7', '10'), key=lambda name: median[name])
             ratio = median['auto'] / median[best]

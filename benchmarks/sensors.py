@@ -20,6 +20,7 @@ from accel_calib.table import COLUMNS, concatenated, Floats, numbered, Poses
 from accel_calib.units import MG
 from generator import Simulated
 import numpy as np
+from scipy.signal import lfilter
 
 NOISE = 3e-4
 """Standard deviation of a pose mean by axis [g]."""
@@ -50,6 +51,15 @@ def draw_model(rng: np.random.Generator, offset: float = 0.03) -> Model:
     """Draw a sensor with offset, gains and cross-axis gains, as a model of the package."""
     sizes = {'offset': offset, 'axis_gain': 0.02, 'cross_axis': 0.01}
     return model_with({name: rng.normal(size=3) * size for name, size in sizes.items()})
+
+
+def draw_noise(rng: np.random.Generator, count: int, rate_hz: float, correlation: float
+               ) -> Floats:
+    """Return (count, 3) noise of variance 1 with this correlation time [s]."""
+    keep = np.exp(-1.0 / (rate_hz * correlation)) if correlation > 0.0 else 0.0
+    start = int(10.0 * correlation * rate_hz)
+    white = rng.normal(size=(count + start, 3))
+    return np.asarray(lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], white, axis=0)[start:])
 
 
 def join(poses: Poses, more: Poses) -> Poses:

@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation
+from sensors import draw_noise
 
 KINDS = {'plain': 'turned by hand', 'tremor': 'also held in the hand, tremor of 1 to 10 mg',
          'turning': 'also turned at 0.5 to 5 °/s', 'footsteps': 'steps of 2 to 20 mg beside it',
@@ -72,7 +73,7 @@ class Case:
     units: Literal['g', 'native'] = 'g'
 
 
-def draw_case(kind: str, seed: int, number: int, noisy: bool) -> Case:
+def draw_case(kind: str, seed: int, noisy: bool, number: int) -> Case:
     """Draw a recording of a kind."""
     rng = np.random.default_rng([seed, list(KINDS).index(kind), number, noisy])
     noise = 1e-3 * float(NOISY_MG if noisy else rng.choice(NOISES_MG))
@@ -94,15 +95,6 @@ def draw_case(kind: str, seed: int, number: int, noisy: bool) -> Case:
     rests = [(a, b) for a, b in itertools.pairwise(edges) if phase[a] == REST]
     return Case(rate_hz, np.arange(len(force)) / rate_hz, reading, rate, force, np.array(rests),
                 phase != REST)
-
-
-def draw_noise(rng: np.random.Generator, count: int, rate_hz: float, correlation: float
-               ) -> Floats:
-    """Return (count, 3) noise of variance 1 with this correlation time [s]."""
-    keep = np.exp(-1.0 / (rate_hz * correlation)) if correlation > 0.0 else 0.0
-    start = int(10.0 * correlation * rate_hz)
-    white = rng.normal(size=(count + start, 3))
-    return np.asarray(lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], white, axis=0)[start:])
 
 
 def draw_motion(rng: np.random.Generator, kind: str, size: float, rate_hz: float
@@ -252,9 +244,9 @@ class Score(NamedTuple):
     normalised: list[Floats]  # (3,) normalised errors
 
 
-def score_rules(kind: str, seed: int, number: int, noisy: bool) -> list[Score]:
+def score_rules(kind: str, seed: int, noisy: bool, number: int) -> list[Score]:
     """Draw a recording and compare the poses of each rule with the truth."""
-    case, scores = draw_case(kind, seed, number, noisy), []
+    case, scores = draw_case(kind, seed, noisy, number), []
     for rule in RULES.values():
         inside = np.zeros(len(case.time), dtype=bool)
         errors, norms, normalised, false = [], [], [], []
@@ -324,7 +316,7 @@ def measure(frame: Frame, sets: int, seed: int, noisy: bool) -> Sums:
     """Return the sums of all rules on recordings of all kinds."""
     found: Sums = {}
     for kind in KINDS:
-        scores = frame.run(score_rules, [(kind, seed, number, noisy) for number in range(sets)])
+        scores = frame.run_sets(score_rules, sets, kind, seed, noisy)
         for rule, each in zip(RULES, zip(*scores)):
             found[kind, rule] = sum_scores(each)
     return found
@@ -398,7 +390,7 @@ def is_captured(index: int, seed: int, number: int) -> bool:
 def lines_of_first(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
     """Yield how often a sensor that never rested before is captured, for each disturbance."""
     for index, each in enumerate(FIRST):
-        share = np.mean(frame.run(is_captured, [(index, seed, k) for k in range(sets)]))
+        share = np.mean(frame.run_sets(is_captured, sets, index, seed))
         asked = {0.95: '≥ 95 %', 0.0: '0 %', None: ''}[each.least]
         met = None if each.least is None else bool(
             share >= each.least if each.least else share == 0.0)

@@ -314,6 +314,14 @@ def temporary() -> Iterator[Path]:
     shutil.rmtree(folder)
 
 
+@pytest.fixture(scope='session', autouse=True)
+def without_waiting_for_the_disk() -> Iterator[None]:
+    """Let what is stored stay in memory: a session of a test stores hundreds of files."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, 'fsync', lambda _: None)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def defects_are_failures(temporary: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Fail a test that left the details of an exception that nobody expected."""

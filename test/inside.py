@@ -28,7 +28,7 @@ from accel_calib.cli.commands import COMMANDS, HIDDEN as DEMO_CHOICES, parser
 from accel_calib.cli.frame import Output, shown
 from accel_calib.cli.main import main
 from accel_calib.cli.nodes import changes, screen, state
-from accel_calib.cli.options import in_one_line
+from accel_calib.cli.options import in_one_line, plain_handler
 from accel_calib.comparison import rotation_free
 from accel_calib.comparison.agreement import (
     on_one_scale, outlier, p_values, Repeatability, repeatability_of, Runs)
@@ -51,8 +51,7 @@ from accel_calib.fleet.recording import (
 from accel_calib.fleet.run import mapped
 from accel_calib.fleet.sensors import alike, drift_of, merge_sensor, write_parquet
 from accel_calib.geometry import (
-    attitude_words, distinct, OVER_THE_SPHERE, quaternion_of, rotation_from_rpy, spread_directions,
-    unit, words_of)
+    distinct, OVER_THE_SPHERE, quaternion_of, rotation_from_rpy, spread_directions, unit, words_of)
 from accel_calib.logs import bag_samples, child, layout_with, LogOptions, open_bag, open_log, text
 from accel_calib.logs.names import meaning
 from accel_calib.logs.quantities import are_samples
@@ -66,8 +65,7 @@ from accel_calib.refinement import search as refine_search
 from accel_calib.refinement.curves import (
     _grown as grown_curve, _rss_beside as rss_beside, best_curve, FoundCurve, Process, process_of,
     SIGNIFICANT, Walk, walk_beside)
-from accel_calib.refinement.linear import (
-    _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, Set, with_outliers)
+from accel_calib.refinement.linear import _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, Set
 from accel_calib.refinement.search import (
     _is_better as is_better_than_walk, _less as less, sampled, search as search_effects)
 from accel_calib.refinement.settle import accepted, explored, Near, probabilities, reshaped
@@ -81,7 +79,6 @@ from accel_calib.report.sheet import drawn, page as page_of
 from accel_calib.report.stability import comparison_page
 from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store, worker
-from accel_calib.session.commands import poses_changed
 from accel_calib.session.conditions import figures, step_of
 from accel_calib.session.poses import Guide, LiveCapture
 from accel_calib.session.settings import changed
@@ -93,8 +90,7 @@ from accel_calib.session.use import adopt as use_calibration, fit as fit_in_node
 from accel_calib.session.worker import Worker, WorkerProcess
 from accel_calib.stillness import rest_after, rounding_left, with_temperature
 from accel_calib.stillness.chunks import repeated_extremes
-from accel_calib.stillness.trend import (
-    _long_run as long_run, excess_of_means, oscillation, trend_of)
+from accel_calib.stillness.trend import _long_run as long_run, excess_of_means, oscillation
 from accel_calib.stored import calibration_yaml, plain_yaml
 from accel_calib.stored.calibration_yaml import calibration_bytes, calibration_from
 from accel_calib.stored.exports import (

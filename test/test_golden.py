@@ -46,5 +46,6 @@ def test_no_figure_depends_on_a_text_of_a_finding(
     assert not list(differences(expected['figures'], found['figures']))
 
 
-def test_there_is_no_result_without_a_case() -> None:
+def test_each_result_has_one_case() -> None:
+    assert CASES.keys().isdisjoint(SWEEPS)
     assert {path.stem for path in EXPECTED.iterdir()} == {*CASES, *SWEEPS}

@@ -98,11 +98,7 @@ def test_with_a_mounting_all_fields_are_in_one_frame(levelled):
     after = Rotation.from_quat(found[:, ORIENTATION])
     np.testing.assert_allclose(after.apply(found[:, ANGULAR_VELOCITY]),
                                before.apply(fields[:, ANGULAR_VELOCITY]))
-
-
-def test_a_known_covariance_is_transformed_and_grows_by_that_of_the_calibration(levelled):
-    fields = fields_of()
-    found = corrected(levelled, fields)
+    # A known covariance is transformed, and grows by that of the calibration.
     inverse = levelled.model.rotation.T @ np.linalg.inv(levelled.gain)
     own = inverse @ fields[:, ACCELERATION_COVARIANCE].reshape(-1, 3, 3) @ inverse.T
     added = found[:, ACCELERATION_COVARIANCE].reshape(-1, 3, 3) - own
@@ -239,16 +235,6 @@ def test_bytes_are_corrected_as_numbers_are(effects, turned):
         assert layout_of(found).frame_id == name
         check_equal(doubles_of(found), wanted)
     assert published > COUNT // 16
-
-
-@pytest.mark.parametrize('turned', [False, True])
-@pytest.mark.parametrize('part', COVARIANCES)
-def test_a_covariance_that_is_not_finite_becomes_unknown(part, turned):
-    doubles = np.zeros(37)
-    doubles[ACCELERATION], doubles[part.start + 4] = (0.0, 0.0, STANDARD_GRAVITY), math.nan
-    data = message(doubles)
-    found = rewriter_of(data, calibration_of({}, turned=turned))(data, {'temperature': 25.0})
-    np.testing.assert_array_equal(doubles_of(found)[part], 0.0)
 
 
 OTHERS = [name for name, effect in EFFECTS.items() if not effect.linear]

@@ -4,7 +4,6 @@
 """Noise figures from a long rest, by Allan deviation."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 import json
 from pathlib import Path
 import re
@@ -18,11 +17,10 @@ from accel_calib.noise import noise_of, NoiseFigures, to_json
 from accel_calib.table import Floats, Recording
 from accel_calib.units import STANDARD_GRAVITY
 from inside import (
-    ALLAN_COMPONENTS, allan_variances, fit_components, longest_rest, octaves, shares,
-    spread_directions, spread_of)
+    ALLAN_COMPONENTS, allan_variances, fit_components, longest_rest, octaves, shares, spread_of)
 import numpy as np
 import pytest
-from shared import changed, G, poses_of, run, run_json, samples_of
+from shared import changed, G, run, samples_of
 
 allantools = pytest.importorskip('allantools')
 
@@ -158,21 +156,16 @@ def test_rates_in_counts_are_not_taken_for_rad_s() -> None:
     assert to_json(found)['accelerometer_noise_density'] is not None
 
 
-def test_the_longest_rest_of_a_recording_with_turns_is_used() -> None:
+def test_the_longest_rest_between_turns_and_interruptions_is_used() -> None:
     parts = [resting(6, 3000), resting(7, 20_000, mean=(0.0, 1.0, 0.0)),
              resting(8, 5000, mean=(1.0, 0.0, 0.0))]
-    rest = longest_rest(sampled(np.concatenate([part.reading for part in parts])), G)
-    assert 28.0 < rest.start < 35.0
-    assert 19_000 < rest.samples <= 20_000
-    assert rest.values[1].mean() == pytest.approx(1.0, abs=0.01)
-
-
-def test_a_rest_ends_at_an_interruption() -> None:
-    recording = resting(9, 30_000)
-    time = recording['time'] + 60.0 * (np.arange(30_000) >= 10_000)
-    rest = longest_rest(recording.with_columns(time=time), G)
-    assert rest.start > 159.0
-    assert 19_000 < rest.samples <= 20_000
+    turned = sampled(np.concatenate([part.reading for part in parts]))
+    late = turned.with_columns(time=turned['time'] + 60.0 * (np.arange(28_000) >= 9000))
+    for recording, start, samples in ((turned, 30.0, 20_000), (late, 150.0, 14_000)):
+        rest = longest_rest(recording, G)
+        assert start - 2.0 < rest.start < start + 5.0
+        assert samples - 1000 < rest.samples <= samples
+        assert rest.values[1].mean() == pytest.approx(1.0, abs=0.01)
 
 
 def test_single_missing_samples_and_jitter_of_the_stamps_do_not_change_the_figures() -> None:
@@ -252,14 +245,10 @@ def test_the_figures_are_printed_beside_those_of_common_parts_written_and_drawn(
     write_table(tmp_path / 'rest.csv', resting(19, 12_000, gyro=1e-4))
     assert run('noise', tmp_path / 'rest.csv', '--json', tmp_path / 'noise.json', '--report',
                tmp_path / 'noise.html') == 0
-    printed = capsys.readouterr().out
-    lines = printed.splitlines()
-    assert all(len(line) <= 60 or str(tmp_path) in line for line in lines)
+    lines = capsys.readouterr().out.splitlines()
     assert [line.split()[3:] for line in lines if line.startswith('typical')] == [
         ['49', 'to', '280', 'µg/√Hz'], ['2', 'to', '3.5', 'm°/s/√Hz']]
     made = json.loads((tmp_path / 'noise.json').read_text())
-    assert made['gyroscope_noise_density'] == pytest.approx(1e-4, rel=0.05)
-    assert made['update_rate'] == pytest.approx(RATE, rel=1e-3)
     assert made['accelerometer_random_walk'] is None
     assert all(limit > 0.0 for limit in made['accelerometer_random_walk_axes_upper'])
     text = (tmp_path / 'noise.html').read_text()
@@ -274,23 +263,6 @@ def test_a_rest_is_rated(white: float, kind: str) -> None:
     found = {each.kind for each in rating.findings}
     assert kind in found
     assert ('noisy' in found) is (kind == 'noisy')
-
-
-def test_a_calibration_turns_counts_into_g(
-        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rng = np.random.default_rng(21)
-    directions = spread_directions(24)
-    readings = directions * 16384.0 + [100.0, -50.0, 20.0] + rng.normal(size=(24, 3))
-    write_table(tmp_path / 'poses.csv', poses_of(
-        readings, 'native', std=np.full((24, 3), 10.0), count=np.full(24, 100.0)))
-    rest = resting(22, 6000)
-    counts = replace(rest.with_columns(reading=rest.reading * 16384.0 + 20.0), units='native')
-    write_table(tmp_path / 'rest.csv', counts)
-    assert run('fit', tmp_path / 'poses.csv', '-o', tmp_path / 'c.yaml') == 0
-    capsys.readouterr()
-    status, made = run_json(capsys, 'noise', tmp_path / 'rest.csv', '-c', tmp_path / 'c.yaml')
-    assert status == 0
-    assert made['accelerometer_noise_density'] == pytest.approx(1e-4 * STANDARD_GRAVITY, rel=0.05)
 
 
 def test_the_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,31 +3,15 @@
 
 """Plans of poses that separate a named effect from its rivals."""
 
-import csv
 from dataclasses import replace
-import json
 
 from accel_calib.calibration import NextPose, PlannedPose, SessionPlan
-from accel_calib.findings import NOTHING_TO_PLAN, rival_words
+from accel_calib.findings import rival_words
 from accel_calib.refinement import refine
-from generator import Setup, simulate, write_csv
-from inside import attitude_words, choose_levels, Guide, model_with, simulate_poses, step_of
+from inside import choose_levels, Guide, model_with, simulate_poses, step_of
 import numpy as np
 import pytest
-from shared import G, poses_of, random_directions, run, run_json
-
-
-def read_plan(path):
-    """Return the poses of a plan, one mapping of column to text each."""
-    lines = path.read_text().splitlines()
-    return list(csv.DictReader(line for line in lines if not line.startswith('#')))
-
-
-def table(path, hidden, *, size, seed, temperature='wandering'):
-    made = simulate(np.random.default_rng(seed), {hidden: size},
-                    Setup(poses=24, rates='small', temperature=temperature))
-    write_csv(path, made.columns)
-    return path
+from shared import G, poses_of, random_directions
 
 
 def simulated(rng, up=None, *, noise_g, context=None, **effects):
@@ -36,54 +20,6 @@ def simulated(rng, up=None, *, noise_g, context=None, **effects):
                         **{name: np.array(values) for name, values in effects.items()}})
     return simulate_poses(model, random_directions(24, rng) if up is None else up, rng,
                           noise_g=noise_g, context=context)
-
-
-def test_a_plan_that_separates_rivals_is_written(tmp_path):
-    path, found = tmp_path / 'plan.csv', tmp_path / 'found.json'
-    twins = table(tmp_path / 'twins.csv', 'cubic', size=3, seed=[5, 3])
-    assert run('refine', twins, '--plan', path, '--json', found) == 0
-    result, poses = json.loads(found.read_text()), read_plan(path)
-    assert 1 <= len(poses) <= 6
-    for step in result['steps']:
-        assert sum(step['probabilities'].values()) == pytest.approx(1.0)
-        assert sum(step['data_probabilities'].values()) == pytest.approx(1.0)
-        assert set(step['rivals']) < {*step['probabilities'], *step['data_probabilities']}
-    step = next(step for step in result['steps'] if step['effect'] in ('cubic', 'odd_quadratic'))
-    for pose in poses:
-        up = np.array([float(pose[f'up_{axis}']) for axis in 'xyz'])
-        assert set(pose['separates'].split(' / ')) == {'cubic', 'odd_quadratic'}
-        assert np.linalg.norm(up) == pytest.approx(1.0, abs=1e-5)
-        assert pose['attitude'] == attitude_words(up)
-    expected = [float(pose['expected_probability']) for pose in poses]
-    assert expected == sorted(expected)
-    assert expected[-1] > step['data_probabilities'][step['effect']]
-    comments = [line[2:] for line in path.read_text().splitlines() if line.startswith('# ')]
-    assert comments == result['plan']
-
-
-def test_without_rivals_nothing_is_written(tmp_path, capsys):
-    made = simulate(np.random.default_rng([5, 6]), {'quadratic': 10.0}, Setup(poses=24))
-    write_csv(tmp_path / 'clear.csv', made.columns)
-    status, result = run_json(capsys, 'refine', tmp_path / 'clear.csv', '--plan',
-                              tmp_path / 'plan.csv')
-    assert status == 0
-    assert [step['effect'] for step in result['steps']][-1] == 'quadratic'
-    assert result['plan'] == [NOTHING_TO_PLAN]
-    assert not (tmp_path / 'plan.csv').exists()
-
-
-def test_temperature_and_drift_are_separated_at_other_temperatures(tmp_path, capsys):
-    path, rivals = tmp_path / 'plan.csv', table(
-        tmp_path / 'rivals.csv', 'offset_temperature', size=2, seed=[0, 2], temperature='rising')
-    status, _ = run_json(capsys, 'refine', rivals, '--plan', path)
-    poses = read_plan(path)
-    assert status == 0
-    pair = {'offset_temperature', 'offset_drift'}
-    assert all(pair <= set(pose['separates'].split(' / ')) for pose in poses)
-    assert all(-20.0 <= float(pose['temperature']) <= 70.0 for pose in poses)
-    assert float(poses[-1]['expected_probability']) > 0.9
-    waits = [float(pose['wait']) for pose in poses]
-    assert waits == sorted(waits)
 
 
 def test_voltages_of_a_plan_are_the_ends_and_the_middle_of_those_of_the_poses():

@@ -21,7 +21,7 @@ from inside import (
 import numpy as np
 import pandas as pd
 import pytest
-from shared import changed, data, G, random_directions, run, run_json, sensor
+from shared import changed, data, G, random_directions, run, sensor
 
 OFFSET = np.array([0.02, -0.01, 0.03])
 WARM = np.array([6e-4, -4e-4, 5e-4])
@@ -70,12 +70,6 @@ def test_a_temperature_that_is_not_recorded_leaves_no_absurd_offset(seed, is_ref
         assert found.remaining_gap_mg > 0.01
 
 
-def test_a_refinement_warns_of_what_a_fit_warns_of():
-    poses = near_up(np.random.default_rng(1), 62.0)
-    expected = {each for each in fit_poses(poses, G).noted if each.kind == 'undetermined'}
-    assert set() < expected <= {*refine(poses, G).calibration.noted}
-
-
 @pytest.mark.parametrize('seed', [2, 3])
 def test_a_refinement_states_the_largest_error_in_an_uncovered_region(seed):
     rng = np.random.default_rng(seed)
@@ -88,36 +82,6 @@ def test_a_refinement_states_the_largest_error_in_an_uncovered_region(seed):
     largest = np.sqrt(np.max(np.einsum('ni,nij,nj->n', up, covariance, up)))
     stated = float(re.search(r'up to (\d+) times that of a pose', text)[1])
     assert stated == pytest.approx(largest / np.median(poses.noise), abs=0.5)
-
-
-def test_findings_of_one_orientation_are_reported_and_not_stored(tmp_path, capsys):
-    recording, stored = tmp_path / 'recording.csv', tmp_path / 'calibration.yaml'
-    assert run('simulate', '-o', recording, '--recording', '--poses', 1, '--dwell', 600,
-               '--temperature', 20, 40, '--rate', 50, '--effect', 'offset=0.02', '--effect',
-               'offset_temperature=6e-4,-4e-4,5e-4') == 0
-    capsys.readouterr()
-    assert run('refine', recording, '--max-dwell', 20, '-o', stored, '--json', '-') == 2
-    printed = capsys.readouterr()
-    result = json.loads(printed.out)
-    assert {'offset_temperature', 'offset_drift'} & {
-        name for step in result['steps'] for name in (step['effect'], *step['rivals'])}
-    assert 'same orientation' in result['refusal']
-    assert not stored.exists()
-
-
-@pytest.mark.parametrize('arguments', [[], ['--base', 'ideal']])
-def test_six_faces_report_what_they_cannot_show(arguments, tmp_path, capsys):
-    table, page = tmp_path / 'faces.csv', tmp_path / 'page.html'
-    faces = np.vstack([np.eye(3), -np.eye(3)]) * 9.81 + [0.1, 0.2, -0.1]
-    faces += np.random.default_rng(3).normal(size=(6, 3)) * 0.003
-    np.savetxt(table, faces, '%.3f', ',', header='ax,ay,az', comments='')
-    status, result = run_json(capsys, 'refine', table, '--report', page, *arguments)
-    assert status == (result['rating'] == 'BAD') == bool(arguments)
-    named = {name for step in result['steps'] for name in (step['effect'], *step['rivals'])}
-    assert named <= {'offset', 'gain', 'axis_gain'}
-    assert 'cross_axis' in [entry['effect'] for entry in result['not_testable']]
-    assert result['remaining_gap_mg'] < 2.0
-    assert page.read_text().startswith('<!DOCTYPE html>')
 
 
 @pytest.mark.parametrize('structure', [{'taken_back': ('cubic',)}, {'added': ('offset_wander',)}])
@@ -134,7 +98,7 @@ def test_structure_that_is_not_understood_remains_a_gap(structure):
 
 def test_poses_that_scatter_alike_hide_nothing_though_their_noise_differs():
     found = [ac.refine(table([6, seed], {'repeatability': 5.0}, shaking=30.0), base='10')
-             for seed in range(8)]
+             for seed in range(4)]
     assert {each.verdict for each in found} == {'unexplained'}
     assert all(each.remaining_gap_mg == pytest.approx(each.gap_mg, rel=1e-6)
                for each in found if not each.steps)

@@ -63,15 +63,6 @@ def test_the_stated_uncertainty_covers_the_true_bias_also_without_the_noise(coun
     assert 0.8 < np.median(ratio) < 1.25
 
 
-def test_successive_rests_with_similar_errors_count_less():
-    slow = np.outer(np.sin(np.arange(24) / 4.0), np.ones(3)) * 1e-3
-    poses = rests(1)
-    drifting = found(poses.with_columns(rate=poses['rate'] + slow))
-    mixed = found(poses.with_columns(
-        rate=poses['rate'] + np.random.default_rng(2).permutation(slow)))
-    assert np.all(drifting.sd > 1.5 * mixed.sd)
-
-
 def test_a_slope_over_temperature_is_found_where_it_is_and_only_there():
     warmth, slope = np.linspace(20.0, 40.0, 24), np.array([2e-4, 0.0, -3e-4])
     for seed in range(10):
@@ -85,18 +76,15 @@ def test_a_slope_over_temperature_is_found_where_it_is_and_only_there():
     assert np.mean(np.array(slopes) != 0.0) < 0.01
 
 
-@pytest.mark.parametrize('rate', [0.01, 0.05, 0.3])
-@pytest.mark.parametrize('warmth', [None, np.linspace(20.0, 40.0, 24)])
-def test_a_rest_at_which_the_platform_turned_is_ignored(rate, warmth):
+def test_a_rest_at_which_the_platform_turned_is_ignored_beside_a_slope():
+    warmth, slope = np.linspace(20.0, 40.0, 24), (2e-3, 0.0, -3e-3)
     for seed in range(5):
-        poses = rests(seed, warmth=warmth)
-        row = seed % len(poses)
-        moved = np.outer(np.arange(len(poses)) == row, rate * TURNING)
+        poses = rests(seed, warmth=warmth, slope=slope)
+        moved = np.outer(np.arange(len(poses)) == seed, 0.01 * TURNING)
         gyro = found(poses.with_columns(rate=poses['rate'] + moved))
-        expected = found(without(poses, row))
+        expected = found(without(poses, seed))
         assert gyro.rests < len(poses)
         assert np.all(np.abs(gyro.bias - expected.bias) < gyro.sd)
-        np.testing.assert_allclose(gyro.sd, expected.sd, rtol=0.4)
 
 
 def test_noise_that_is_not_known_is_nan():
@@ -162,19 +150,6 @@ def test_a_real_gyro_has_the_bias_of_its_quietest_seconds(name):
     assert np.all(gyro.sd > np.radians(0.003))
 
 
-def fitted(**known):
-    return fit_poses(rests(10, **known), G, model='4', date='2026-01-01T00:00:00+00:00')
-
-
-def test_a_fit_has_bias_and_noise_and_levelling_keeps_them():
-    calibration = fitted()
-    assert calibration.noise is not None
-    assert np.all(np.abs(calibration.gyro.bias - BIAS) < 5.0 * calibration.gyro.sd)
-    levelled = level(calibration, np.array([0.0, 0.0, 1.0]), 'ros')
-    assert levelled.gyro is calibration.gyro
-    assert levelled.noise is calibration.noise
-
-
 def test_poses_that_the_fit_rejects_are_no_rests():
     poses = rests(11)
     moved = (np.arange(len(poses)) == 5)[:, np.newaxis]
@@ -197,10 +172,11 @@ def test_a_refinement_takes_the_bias_of_new_rests_with_rates_and_keeps_the_store
 
 @pytest.mark.parametrize('known', [
     {}, {'warmth': np.linspace(20.0, 40.0, 24), 'slope': (2e-4, 0.0, -3e-4)}])
-def test_bias_and_noise_are_read_as_they_were_written(known):
-    calibration = fitted(**known)
-    text = format_calibration(calibration)
-    read = parse_calibration(text, 'x.yaml')
-    assert format_calibration(read) == text
-    assert read.warnings == calibration.warnings
-    assert (read.gyro, read.noise) == (calibration.gyro, calibration.noise)
+def test_a_fit_has_bias_and_noise_which_levelling_and_a_file_keep(known):
+    calibration = fit_poses(rests(10, **known), G, model='4')
+    assert calibration.noise is not None
+    assert np.all(np.abs(calibration.gyro.bias - BIAS) < 5.0 * calibration.gyro.sd)
+    levelled = level(calibration, np.array([0.0, 0.0, 1.0]), 'ros')
+    read = parse_calibration(format_calibration(levelled), 'x.yaml')
+    for kept in (levelled, read):
+        assert (kept.gyro, kept.noise) == (calibration.gyro, calibration.noise)

@@ -6,12 +6,13 @@
 from dataclasses import replace
 import json
 from pathlib import Path
+import signal
 from socket import AF_INET, SOCK_DGRAM, socket
 from typing import Any
 
 from accel_calib.errors import AccelCalibError
 from accel_calib.geometry import coverage
-from faults.sample import FACTOR
+from faults.sample import FACTOR, sample
 from geometry_msgs.msg import Vector3Stamped
 from inside import DEMO_CHOICES, main, own_domain
 from inside_ros import SimulatedImu, SimulatorSettings
@@ -68,10 +69,11 @@ def test_the_samples_end_after_the_last_pose_unless_it_is_held_or_comes_again() 
     np.testing.assert_array_equal(again[whole + 5:whole + 5 + 20], again[:20])
 
 
-def test_the_node_is_turned_by_its_services(bench: Any) -> None:
+@pytest.mark.parametrize('number', sample((signal.SIGINT, signal.SIGTERM), 1))
+def test_the_node_is_turned_by_its_services_and_ended_by_signals(bench: Any, number: int) -> None:
     truth = bench.listen(Vector3Stamped, 'simulator/truth')
     given = {'poses': 2, 'dwell': 0.0, 'turn': 0.2, 'flat_last': False}
-    bench.start('simulator', **given)
+    node = bench.start('simulator', **given)
     first, second = 9.80665 * SimulatedImu(SimulatorSettings(**given)).directions
 
     def call(name: str) -> Any:
@@ -89,6 +91,9 @@ def test_the_node_is_turned_by_its_services(bench: Any) -> None:
     assert not call('next').success
     assert call('flat').success
     bench.spin(lambda: up() == (0.0, 0.0, 9.80665))
+    status, printed = bench.end(node, number)
+    assert status == 0, printed
+    assert 'Traceback' not in printed
 
 
 @pytest.mark.parametrize('hidden', ('temperature',) if FACTOR == 1 else (None, *DEMO_CHOICES))

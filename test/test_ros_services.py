@@ -83,25 +83,16 @@ def test_poses_are_captured_and_removed_on_request(bench: Any, readings: Reading
     bench.spin(lambda: still[-1].data)
     assert bench.call_while('capture_pose', lambda: bench.imu(poses[300])).success
     bench.spin(lambda: count(markers) == 2)
+    known = len(diagnostics)
+    bench.spin(lambda: len(diagnostics) > known + 2)  # nothing more is to be drawn
+    later = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
+    bench.spin(lambda: count(later) == 2)
     stored = bench.home / 'accel_calib' / 'arm_poses.csv'
     bench.spin(lambda: len(read_poses(stored)) == 2)
     assert bench.call('undo_pose').success
     bench.spin(lambda: count(markers) == 1)
     assert bench.call('undo_pose').success
     assert not bench.call('undo_pose').success
-
-
-def test_poses_are_drawn_for_a_listener_who_comes_later(bench: Any, readings: Readings) -> None:
-    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
-    bench.calibrator(passthrough=True)
-    bench.feed(readings([[0, 0, 1], [1, 0, 0]], dwell=3.0))
-    bench.spin(lambda: diagnostics and any((value.key, value.value) == ('poses captured', '2')
-                                           for value in diagnostics[-1].status[0].values))
-    known = len(diagnostics)
-    bench.spin(lambda: len(diagnostics) > known + 2)  # nothing more is to be drawn
-    markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
-    bench.spin(lambda: count(markers) == 2)
-    bench.spin(lambda: 'no Imu messages' in markers[-1].markers[-1].text)  # the next step
 
 
 def test_self_test_names_what_fails(bench: Any, stored: Stored) -> None:
@@ -220,7 +211,8 @@ def events_executor(context: Any) -> Any:
 
 
 @pytest.mark.parametrize('make_executor', [SingleThreadedExecutor, events_executor])
-def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any) -> None:
+def test_callbacks_continue_while_a_service_works_and_after_an_error(
+        bench: Any, make_executor: Any, capfd: pytest.CaptureFixture[str]) -> None:
     context = bench.node.context
     node = Node('calibrator', context=context)
     logged, ticks, threads = [], [], set()
@@ -259,6 +251,7 @@ def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any
     spinner = threading.Thread(target=spin)
     spinner.start()
     try:
+        in_executor(node)(lambda: math.sqrt(-1.0))
         assert bench.call('fit').message == f'{TICKS} ticks'
         assert threads == {spinner}
         answer = bench.call('load')
@@ -266,30 +259,15 @@ def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any
         assert bench.call('save').message == 'at once'
         lines = [event for event in logged if isinstance(event, Log)]
         assert [line.severity for line in lines] == ['info', 'warning', 'info']
+        printed = capfd.readouterr().err
+        assert printed.count('unexpected error') == 1
+        assert 'ValueError: math' in printed
     finally:
         over.set_result(None)
         spinner.join()
         worker.close()
         executor.shutdown()
         node.destroy_node()
-
-
-@pytest.mark.parametrize('make_executor', [SingleThreadedExecutor, events_executor])
-def test_an_error_of_a_function_is_logged_and_the_executor_continues(
-        bench: Any, make_executor: Any, capfd: pytest.CaptureFixture[str]) -> None:
-    executor = make_executor(context=bench.node.context)
-    node = Node('calibrator', context=bench.node.context)
-    executor.add_node(node)
-    call_soon, over = in_executor(node), Future()
-    call_soon(lambda: math.sqrt(-1.0))
-    call_soon(lambda: over.set_result(None))
-    executor.spin_until_future_complete(over, timeout_sec=60.0)
-    executor.shutdown()
-    node.destroy_node()
-    assert over.done()
-    printed = capfd.readouterr().err
-    assert printed.count('unexpected error') == 1
-    assert 'ValueError: math' in printed
 
 
 @pytest.fixture

@@ -136,9 +136,10 @@ def viewer(bench: Any, tmp_path: Path) -> Iterator[Viewer]:
     made.close()
 
 
-def test_a_whole_calibration_through_the_commands_of_the_page(
+def test_a_whole_calibration_through_the_page_of_a_node_that_ends_and_logs_no_token(
         bench: Any, viewer: Viewer, readings: Readings, tmp_path: Path) -> None:
-    path = tmp_path / 'c.yaml'
+    path, node = tmp_path / 'c.yaml', viewer.node  # type: ignore[attr-defined]
+    heard = bench.listen(rcl_interfaces.msg.Log, '/rosout', latched=True)
     refusal = bench.call('fit').message
     bench.spin(lambda: refusal in [line['words'] for line in viewer.of('log')])
     assert viewer.ask('fit', bench.spin)['words'] == refusal
@@ -171,10 +172,6 @@ def test_a_whole_calibration_through_the_commands_of_the_page(
     assert viewer.ask('undo', bench.spin)['success']
     assert viewer.state['result'] is None
 
-
-def test_a_node_with_viewers_ends_cleanly_and_logs_no_token(bench: Any, viewer: Viewer) -> None:
-    node = viewer.node  # type: ignore[attr-defined]
-    heard = bench.listen(rcl_interfaces.msg.Log, '/rosout', latched=True)
     bench.spin(lambda: any('live page: ' in line.msg for line in heard))
     code, printed = bench.end(node, signal.SIGINT)
     assert (code, 'Traceback' in printed) == (0, False)

@@ -15,62 +15,12 @@ from pathlib import Path
 
 from accel_calib.errors import AccelCalibError
 from accel_calib.session import enable, Mounting, run
-from accel_calib.stored import read_calibration
-from inside import main, spread_directions
+from inside import spread_directions
 import pytest
 from shared import Readings, result, Stored
 from test_session import Driver
 
 pytestmark = pytest.mark.usefixtures('home')
-
-
-@pytest.fixture(scope='module')
-def tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with poses and a recording of no sensor, of a and of b."""
-    folder = tmp_path_factory.mktemp('tables')
-    for kind, options in (('poses', []), ('recording', ['--recording'])):
-        path = folder / f'{kind}.csv'
-        assert main(['simulate', '-o', str(path), '--effect', 'offset=0.01,0.02,0.03',
-                     *options]) == 0
-        for name, text in (('a', '"a"'), ('b', 'b')):
-            (folder / f'{kind}_{name}.csv').write_text(f'# sensor: {text}\n{path.read_text()}')
-        path.rename(folder / f'{kind}_.csv')
-    return folder
-
-
-@pytest.mark.parametrize(('command', 'owner', 'data', 'stated', 'accepted'), [
-    *((command, owner, data, '', not owner or data in ('', owner))
-      for command in ('verify', 'apply') for owner in ('', 'a') for data in ('', 'a', 'b')),
-    *(('refine', 'a', data, stated, {data, stated} <= {'', 'a'})
-      for data in ('', 'a', 'b') for stated in ('', 'a', 'b'))])
-def test_commands_refuse_data_of_another_sensor(
-        tables: Path, tmp_path: Path, stored: Stored, capsys: pytest.CaptureFixture[str],
-        command: str, owner: str, data: str, stated: str, accepted: bool) -> None:
-    kind, out = 'recording' if command == 'apply' else 'poses', tmp_path / 'out.csv'
-    options = {'apply': ['-o', str(out)], 'refine': ['--sensor', stated] if stated else []}
-    status = main([command, str(tables / f'{kind}_{data}.csv'), '-c', str(stored(sensor=owner)),
-                   *options.get(command, [])])
-    assert (status != 2) == accepted  # 1: the poses are not those of the calibration
-    assert (f'to sensor {owner!r}' in capsys.readouterr().err) is not accepted
-    assert out.exists() is (accepted and command == 'apply')
-
-
-@pytest.mark.parametrize(('data', 'stated', 'name'), [
-    ('', '', ''), ('a', '', 'a'), ('', 'b', 'b'), ('a', 'b', 'b')])
-def test_fit_names_the_sensor_as_stated_or_as_in_the_table(tables: Path, tmp_path: Path,
-                                                           data: str, stated: str, name: str
-                                                           ) -> None:
-    option = ['--sensor', stated] if stated else []
-    out = tmp_path / 'fit.yaml'
-    assert main(['fit', str(tables / f'poses_{data}.csv'), '-o', str(out), *option]) == 0
-    assert read_calibration(out).sensor == name
-
-
-@pytest.mark.parametrize(('names', 'status'), [(('a', 'a'), 0), (('a', ''), 0), (('a', 'b'), 2)])
-def test_compare_refuses_calibrations_of_two_sensors(stored: Stored, names: tuple[str, str],
-                                                     status: int) -> None:
-    files = [str(stored(f'{k}.yaml', sensor=name)) for k, name in enumerate(names)]
-    assert main(['compare', *files]) == status
 
 
 @pytest.mark.parametrize('owner', ['', 'imu_link', 'arm', 'other'])

@@ -11,16 +11,15 @@ from typing import Any
 from accel_calib.calibration import level, set_heading
 from accel_calib.effects import Covariate
 from accel_calib.errors import InputError, StoredCalibrationError
-from accel_calib.finding import Finding, has, LEVELS
-from accel_calib.logs import open_log, read_poses, write_table
+from accel_calib.finding import Finding, LEVELS
+from accel_calib.logs import open_log, read_poses
 from accel_calib.session import (
     CalibratorSettings, changed, enable, Mounting, next_step, progress, Surroundings)
 from accel_calib.stored import read_calibration, write_calibration
-from accel_calib.table import Poses
 from driven import Driver, RATE
 from inside import (
-    LARGEST_NUMBER_OF_STEPS, Model, poses_changed, rotation_from_rpy, SensorStore,
-    spread_directions, store_of, StreamStatistics, use_calibration)
+    LARGEST_NUMBER_OF_STEPS, Model, rotation_from_rpy, SensorStore, spread_directions, store_of,
+    StreamStatistics, use_calibration)
 import numpy as np
 import pytest
 from shared import GRAVITY, python, Readings, ROOT, rows_of, Stored, table, with_effects
@@ -88,34 +87,6 @@ def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
     assert second.finding('calibration').level == 'GOOD'
 
 
-def test_files_that_cannot_be_used_are_never_overwritten(tmp_path: Path, stored: Stored,
-                                                         readings: Readings) -> None:
-    other = stored('use.yaml', sensor='another').read_text()
-    table = 'ax,ay,az\n1,2,words\n'
-    (tmp_path / 'use_poses.csv').write_text(table)
-    (tmp_path / '.use.yaml.12345.tmp').write_text('of a process that was killed')
-    driver = Driver(calibration_file=str(tmp_path / 'use.yaml'))
-    driver.feed(readings(spread_directions(12)))
-    assert driver.finding('calibration').level == 'BAD'
-    assert (tmp_path / 'use.yaml').read_text() == other
-    assert (tmp_path / 'use_poses.csv.damaged1').read_text() == table
-    assert not (tmp_path / '.use.yaml.12345.tmp').exists()
-    assert driver.ask('fit')
-    assert (tmp_path / 'use.yaml.other1').read_text() == other
-    assert read_calibration(tmp_path / 'use.yaml').sensor == 'imu_link'
-    assert len(read_poses(tmp_path / 'use_poses.csv')) == 12
-
-
-@pytest.mark.parametrize('changes', [{'sensor': 'another'}, {'units': 'g'}])
-def test_poses_of_another_sensor_or_unit_are_renamed(changes: Any) -> None:
-    store = store_of(CalibratorSettings(sensor='arm'), 'arm', '/imu')
-    store.save_poses(Poses({'reading': np.array([[0.1, 0.2, 9.8]])}, np.array([1])))
-    write_table(store.poses, replace(read_poses(store.poses), **changes))
-    driver = Driver(sensor='arm')
-    assert len(driver.poses) == 0
-    assert 'arm_poses.csv.damaged1' in driver.logged()
-
-
 def test_calibration_in_g_corrects_messages_in_m_s2(stored: Stored) -> None:
     path, reading = stored(unit='g'), np.array([[1.0, -2.0, 9.0]])
     loaded = Driver(calibration_file=str(path)).calibration
@@ -123,18 +94,6 @@ def test_calibration_in_g_corrects_messages_in_m_s2(stored: Stored) -> None:
     np.testing.assert_allclose(
         loaded.correct(reading), read_calibration(path).correct(reading / GRAVITY) * GRAVITY,
         rtol=1e-14)
-
-
-def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readings) -> None:
-    driver = Driver()
-    rest = readings([UP], dwell=6.0)
-    driver.feed(rest[:100])
-    assert driver.sensor.live.detector.still
-    assert driver.feed(rest[:1], 'another') == 0
-    assert not driver.sensor.live.detector.still
-    assert driver.feed(rest[100:]) == len(rest) - 100
-    assert driver.session.state.statistics.dropped['foreign'] == 1
-    assert driver.finding('stream').level == 'USABLE'
 
 
 @pytest.mark.parametrize(('units', 'per_g'), [('native', 16384.0), ('m/s2', 9.80665)])
@@ -173,20 +132,6 @@ def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
     assert {path.stem for path in home.glob('*.yaml')} == {'imu.data_raw@imu_link'}
 
 
-def test_nothing_is_captured_from_a_sensor_that_fell_silent(stored: Stored, readings: Readings
-                                                            ) -> None:
-    driver = Driver(calibration_file=str(stored()))
-    rest = readings([UP], dwell=6.0)
-    driver.refuses('no Imu message', 'capture_pose', 'set_level')
-    driver.feed(rest[:150])
-    driver.now += 6.0
-    driver.refuses('6.0 s ago', 'capture_pose', 'set_level')
-    driver.feed(rest[150:160])
-    assert driver.ask('capture_pose').startswith('1 pose:')
-    driver.ask('set_level')
-    assert driver.calibration.is_levelled
-
-
 def test_levelling_between_two_messages_imports_no_large_library(stored: Stored) -> None:
     code = ('import sys; from driven import Driver, GRAVITY; import numpy as np; '
             'driver = Driver(calibration_file=sys.argv[1]); '
@@ -202,30 +147,6 @@ def test_levelling_between_two_messages_imports_no_large_library(stored: Stored)
 def captured(driver: Driver) -> list[list[int]]:
     """Return the directions of the captured poses."""
     return np.round(driver.poses.reading / GRAVITY).astype(int).tolist()
-
-
-def test_nothing_of_a_rest_before_a_silence_is_used_after_it(readings: Readings) -> None:
-    driver = Driver()
-    driver.feed(readings([UP], dwell=3.0))
-    driver.now, driver.stamp = driver.now + 2.3, driver.stamp + 2.3
-    driver.feed(np.tile([GRAVITY, 0.0, 0.0], (5, 1)))
-    driver.refuses('still', 'capture_pose', 'set_level')
-    assert 'jumped' not in driver.logged('warning')  # the stamps are as late as the messages
-
-
-@pytest.mark.parametrize('jump', [-3600.0, 86400.0, None])
-def test_a_jump_of_the_clock_is_logged_and_no_pose_counts_twice(
-        jump: float | None, readings: Readings) -> None:
-    driver = Driver()
-    driver.stamp = 10_000.0
-    turned = readings([UP, LEFT, FORWARD, UP], dwell=2.5)
-    for _ in range(3):
-        driver.feed(turned)
-        driver.stamp = 10_000.0 if jump is None else driver.stamp + jump  # a recording in a loop
-    assert captured(driver) == [UP, LEFT, FORWARD]
-    assert driver.logged('warning').count('jumped') == 1  # of two within a minute
-    assert len(driver.sensor.live.detector.interruptions) == 2
-    assert jump or np.all(driver.poses['count'] < 2.0 * 2.5 * RATE * 1.1)
 
 
 def test_a_rest_is_not_used_while_the_stamps_stand(readings: Readings) -> None:
@@ -246,42 +167,6 @@ def test_one_absurd_first_reading_does_not_spoil_the_capture(readings: Readings)
     driver.feed([[0.0, 0.0, 1e200]])
     driver.feed(readings([UP, LEFT], dwell=2.5))
     assert captured(driver) == [UP, LEFT]
-
-
-def test_a_level_pose_that_contradicts_the_given_mounting_is_refused(
-        stored: Stored, readings: Readings) -> None:
-    driver = Driver(calibration_file=str(stored()), mounting_rpy=[0.5, 0.0, 0.0])
-    driver.feed(readings([UP], dwell=6.0)[:200])
-    driver.refuses('10° of tilt', 'set_level')
-
-
-@pytest.mark.parametrize(('old', 'new'), [
-    ('version: 3', 'version: 999'), ('readings: m/s2', 'readings: native'),
-    ('sensor: imu_link', 'sensor: another')])
-def test_a_load_that_is_refused_keeps_the_calibration_in_use(
-        old: str, new: str, stored: Stored, readings: Readings) -> None:
-    path = stored(sensor='imu_link')
-    driver = Driver(calibration_file=str(path))
-    driver.feed(readings([UP])[:30])
-    used = driver.calibration
-    path.write_text(path.read_text().replace(old, new, 1))
-    with pytest.raises(StoredCalibrationError, match=new.split(': ')[1]):
-        driver.ask('load')
-    assert driver.calibration is used is not None
-
-
-def test_reset_removes_poses_and_calibration_but_keeps_the_files(
-        home: Path, readings: Readings) -> None:
-    driver = Driver(sensor='arm')
-    driver.feed(readings(spread_directions(12)))
-    driver.ask('fit')
-    stored = (home / 'arm.yaml').read_bytes()
-    driver.ask('reset')
-    assert driver.calibration is None
-    assert captured(driver) == []
-    assert not {'arm.yaml', 'arm_poses.csv'} & {path.name for path in home.iterdir()}
-    assert (home / 'arm.yaml.reset1').read_bytes() == stored
-    assert len(read_poses(home / 'arm_poses.csv.reset1')) == 12
 
 
 # Guidance
@@ -315,21 +200,6 @@ def test_findings_are_logged_by_their_level(stored: Stored) -> None:
 
 
 # Automatic fits
-
-
-def test_automatic_fits_wait_a_minute_and_keep_a_calibration_that_agrees(
-        home: Path, readings: Readings) -> None:
-    driver = Driver(auto_fit=True)
-    driver.feed(readings(spread_directions(12)))
-    first = driver.calibration
-    assert first is not None
-    driver.feed(readings(spread_directions(31)[:8]))
-    driver.tick(60.0)
-    assert driver.sensor.fitted_poses > 12  # a fit has been made, and agrees
-    assert driver.calibration is first
-    poses_changed(driver.session, ended=False)
-    assert not driver.sensor.auto_fit_waits  # the same poses
-    assert len(list(home.glob('*.before*'))) == 1
 
 
 def test_a_refined_calibration_is_not_replaced_by_an_automatic_fit(readings: Readings) -> None:
@@ -458,52 +328,9 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
 # Frames
 
 
-def put(driver: Driver, readings: Readings, up: Any) -> None:
-    """Let the robot rest with this direction of up, in its own frame."""
-    driver.feed(readings([MOUNTING @ up], dwell=6.0)[:200])
-
-
 def applied(driver: Driver) -> Any:
     """Return the rotation of messages."""
     return driver.session.state.on_topics(driver.calibration).rotation
-
-
-def test_the_heading_needs_a_level_mounting_and_the_nose_down(
-        stored: Stored, readings: Readings) -> None:
-    driver = Driver(calibration_file=str(stored()))
-    put(driver, readings, UP)
-    driver.refuses('not levelled', 'set_heading')
-    driver.ask('set_level')
-    driver.refuses('within 10° of the flat pose', 'set_heading')
-    put(driver, readings, NOSE_DOWN)
-    driver.ask('set_heading')
-    np.testing.assert_allclose(applied(driver), MOUNTING, atol=0.01)
-
-
-@pytest.mark.parametrize(('frame', 'axes'), [
-    ('ros', np.eye(3)), ('ned', np.diag([1.0, -1.0, -1.0])),
-    ('android', [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])])
-def test_messages_are_specific_force_in_every_frame_also_after_a_restart_with_another(
-        stored: Stored, readings: Readings, frame: str, axes: Any) -> None:
-    path = stored()
-    for before in ('ros', frame):
-        driver = Driver(calibration_file=str(path), frame=before)
-        for up, command in ((UP, 'set_level'), (NOSE_DOWN, 'set_heading')):
-            put(driver, readings, up)
-            driver.ask(command)
-        driver.session.close()
-    for after in ('ros', frame):
-        driver = Driver(calibration_file=str(path), frame=after)
-        expected = MOUNTING @ (np.eye(3) if after == 'ros' else axes)
-        np.testing.assert_allclose(applied(driver), expected, atol=0.01)
-        put(driver, readings, UP)
-        gravity = driver.session.state.gravity / GRAVITY
-        np.testing.assert_allclose(gravity, np.array(expected).T @ MOUNTING @ UP, atol=0.01)
-        assert gravity[2] * (-1.0 if after == 'ned' else 1.0) > 0.99
-        driver.ask('set_level')
-        np.testing.assert_allclose(applied(driver), expected, atol=0.01)
-        assert ('it is turned' in driver.logged('warning')) is (frame == 'android')
-        driver.session.close()
 
 
 @pytest.mark.parametrize('frame', ['ned', 'win8'])
@@ -599,16 +426,18 @@ def test_a_start_without_a_column_leaves_it_in_the_stored_poses(
                 assert [column in note for note in log.notes] == [True]
 
 
-def test_a_rest_that_is_no_pose_is_said_with_its_reason(readings: Readings) -> None:
-    driver = Driver(min_dwell=1.5)
-    driver.feed(readings(spread_directions(4)))
-    driver.feed(readings(spread_directions(9)[6:], dwell=1.0))
-    assert [line.words for line in driver.log if 'gave no pose' in line.words] == [
-        'this rest gave no pose: shorter than min_dwell']
-    driver.feed(np.zeros((150, 3)))
-    driver.feed(readings(spread_directions(12)))
-    driver.ask('fit')
-    assert has(driver.calibration.noted, 'missing')
-    driver.ask('undo_pose')
-    driver.ask('refine')
-    assert has(driver.calibration.noted, 'missing')
+def test_without_a_thermometer_the_middle_of_the_range_corrects_and_is_said(
+        stored: Stored, readings: Readings) -> None:
+    path = stored(sensor='imu_link')
+    calibration = with_effects(
+        read_calibration(path), {'offset_temperature': [0.01, -0.015, 0.02]}, 1e-14,
+        temperature=np.linspace(20.0, 40.0, 20))
+    write_calibration(path, calibration)
+    driver, reading = Driver(calibration_file=str(path)), readings([[0.0, 0.6, 0.8]])
+    driver.feed(reading)
+    driver.tick(31.0)
+    found = np.array(driver.sensor.force_of(tuple(reading[0]), driver.session.state.context))
+    expected = calibration.apply(reading[:1], temperature=[30.0])[0]
+    np.testing.assert_allclose(found * GRAVITY, expected, atol=1e-6)
+    assert 'no temperature arrives' in driver.finding('stream').words
+    assert driver.finding('stream').level == 'USABLE'

@@ -11,7 +11,7 @@ from inside import (
     accepted, beginning, Block, candidates, explored, fitted_state, FoundCurve, grown_curve,
     is_better_than_walk, less, Linear, linearised, Model, Near, outside_of, Process, process_of,
     RARE, REFINE_LEVEL, reshaped, rss_beside, search_effects, Set, SIGNIFICANT, simulate_poses,
-    spread_directions, Walk, walk_beside, with_outliers, WORTH)
+    spread_directions, Walk, walk_beside, WORTH)
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -201,21 +201,6 @@ def test_two_effects_are_found_where_neither_alone_is_significant():
     assert all(best.probability(name) < REFINE_LEVEL for name in best.effects)
 
 
-@pytest.mark.parametrize(('hidden', 'knocked', 'tried'), [
-    ({'offset_temperature': [3e-4, -2e-4, 2e-4]}, (4, 17, 33, 51), EFFECTS),
-    ({'offset_step': [4e-3, -4e-3, 4e-3, 180.0]}, (),  # before it: 6 poses of 60
-     ('offset_step', 'quadratic', 'offset_drift')), ({}, (), EFFECTS)])
-def test_effects_and_knocked_poses_are_found_and_nothing_in_noise(hidden, knocked, tried):
-    _, linear = problem_of(poses_of(hidden, knocked=knocked), *tried)
-    best = next(accepted(explored(linear)))
-    assert (best.effects, best.out) == (tuple(hidden), knocked)
-    for found, true in zip(best.parts.values(), hidden.values(), strict=True):
-        np.testing.assert_allclose(found, true[:3], atol=0.15 * max(true[:3]))
-    if not hidden:
-        assert best.score == 0.0
-        assert [each.out for each in with_outliers([Set.of(linear)])] == [()]
-
-
 @pytest.mark.parametrize(('better', 'preferred'), [(1.9, 'quadratic'), (2.1, 'cubic')])
 def test_of_sets_that_are_almost_as_good_the_one_with_fewest_values_is_preferred(
         better, preferred):
@@ -324,17 +309,6 @@ def test_a_held_out_residual_beside_a_walk_is_predicted_by_the_other_orientation
         expected = own[k] - row @ np.linalg.solve(variance[np.ix_(others, others)], own[others])
         assert held_out[k] == pytest.approx(expected)
     np.testing.assert_allclose(left, np.linalg.solve(variance, beside(np.arange(15))))
-
-
-def test_a_walk_is_likely_where_the_offset_walks_and_not_in_noise():
-    likely, steps = [], np.random.default_rng(3).normal(size=(COUNT, 3))
-    for size_g in (1e-3, 0.0):
-        poses = poses_of({}, seed=3)
-        poses = poses.with_columns(reading=poses.reading + np.cumsum(steps * size_g, axis=0))
-        linear = problem_of(poses, 'offset_drift')[1]
-        likely.append(walk_beside(Set.of(linear), process_of(linear, poses)).likelihood_ratio)
-    assert likely[0] > 3.0 * SIGNIFICANT
-    assert likely[1] < 0.5 * SIGNIFICANT
 
 
 @pytest.mark.parametrize(('seed', 'stays'), [(5, True), (3, False)])

@@ -6,17 +6,16 @@
 from dataclasses import replace
 
 from accel_calib.errors import InputError
-from accel_calib.logs import read_recording
 from accel_calib.stillness import (
     capture, Captured, CaptureSettings, poses_from, select, StillDetector)
 from accel_calib.units import units_of
 from inside import (
-    excess_of_means, long_run, Model, oscillation, repeated_extremes, simulate_recording, trend_of)
+    excess_of_means, long_run, Model, oscillation, repeated_extremes, simulate_recording)
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation, Slerp
-from shared import data, G, NATIVE, rows_of as rows, samples_of, table
+from shared import G, NATIVE, rows_of as rows, samples_of, table
 
 
 def still(seed, seconds, rate=100.0, noise=2e-3):
@@ -319,24 +318,6 @@ def test_a_dwell_that_is_not_still_according_to_later_ones_is_doubtful():
     assert start < 1.0
 
 
-def test_trends_are_those_of_least_squares():
-    values, white = np.random.default_rng(4).normal(size=(3, 12)), np.array([[0.1], [0.2], [0.3]])
-    found = trend_of(values, 12, 0.5, white)
-    time = 0.5 * np.arange(12)
-    fitted = np.polyfit(time, values.T, 1)
-    left = values.T - np.outer(time, fitted[0]) - fitted[1]
-    np.testing.assert_allclose(found.slope[:, 0], fitted[0])
-    np.testing.assert_allclose(found.square[:, 0], np.sum(left ** 2, axis=0))
-    squares, neighbours = (np.sum(each / white.T) for each in (left ** 2, left[1:] * left[:-1]))
-    rho = min(max(neighbours / squares + 0.25, 0.0), 0.9)
-    excess = squares / 30.0 * (1.0 + rho) / (1.0 - rho)
-    spread = white / np.sum((time - time.mean()) ** 2)
-    assert squares > 30.0  # so that the power is not that of white noise
-    np.testing.assert_allclose(found.excess, [excess])
-    np.testing.assert_allclose(found.strength, np.sum(found.slope ** 2 / spread) / excess)
-    np.testing.assert_allclose(found.error, np.sqrt(np.max(spread)))
-
-
 def test_correlations_at_lags_of_half_a_series_and_more_are_not_used():
     known = np.array([1.0, 0.5, 0.3, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
     beyond = known + 0.3 * (np.arange(9) >= 4)
@@ -369,20 +350,6 @@ def visited(directions):
     return found['time'], found.reading
 
 
-def test_a_sensor_that_lay_still_for_days_has_one_pose_per_orientation_unless_split():
-    samples = read_recording(data('sensehat_lsm9ds1_temperature.csv'))
-    result = capture(samples, G)
-    assert 3 <= len(result.poses) <= 5
-    assert result.samples > 24000
-    assert [each.kind for each in result.interruptions] == ['gap']
-    assert 'orientation' not in result.poses
-    poses = capture(samples, G, CaptureSettings(max_dwell=3600)).poses
-    assert 60 < len(poses) < 80
-    assert np.bincount(poses['orientation']).max() == pytest.approx(58, abs=1)
-    assert np.ptp(poses['temperature']) > 1.0
-    assert np.all(np.diff(poses['time']) > 0.0)
-
-
 FACES = [(0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, -1), (0, -1, 0), (-1, 0, 0)]
 AGAIN = [*FACES, (0.03, 0.0, 0.9996), (0.0, 0.9996, 0.02)]
 
@@ -403,14 +370,6 @@ def test_a_doubtful_pose_does_not_take_the_place_of_a_sure_one(repeated):
     assert [each.doubtful for each in kept] == [True, *[False] * 6]
     assert kept[0] is dwells[0]
     assert kept[6] is dwells[6]
-
-
-def test_merged_poses_lie_on_the_sphere_and_are_less_noisy():
-    kept, poses = (captured(*visited(AGAIN), settings=CaptureSettings(repeated=repeated)).poses
-                   for repeated in ('keep', 'merge'))
-    assert np.linalg.norm(poses.reading[0]) == pytest.approx(1.0, abs=4e-4)
-    assert poses.reading[0, 0] == pytest.approx(0.015, abs=1e-3)
-    assert np.all(poses.noise[:2] < kept.noise[:2])
 
 
 def test_a_number_that_is_not_finite_is_refused_with_its_row():

@@ -5,6 +5,7 @@
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 import re
 
@@ -35,10 +36,16 @@ GATHERED = [ROOT / 'test' / name for name in ('inside.py', 'inside_ros.py')]
 TESTS = sorted({*(ROOT / 'test').rglob('*.py')} - {*GATHERED})
 
 
+@cache
+def nodes_of(path: Path) -> list[ast.AST]:
+    """Return the nodes of the syntax tree of a module, the module itself first."""
+    return [*ast.walk(ast.parse(path.read_text(encoding='utf-8')))]
+
+
 def imports_of(path: Path) -> Iterator[str]:
     """Yield the full names that a module imports, including those for types."""
     package = path.parent.relative_to(ROOT).parts
-    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+    for node in nodes_of(path):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -64,7 +71,7 @@ def test_no_constant_stands_in_two_files() -> None:
     """Sizes of buffers, which are powers of two, and their largest number may be equal."""
     found: dict[float, set[Path]] = {}
     for path in MODULES:
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        for node in nodes_of(path):
             if isinstance(node, ast.Constant) and type(node.value) in (int, float):
                 digits = repr(node.value).partition('e')[0].replace('.', '').strip('0')
                 whole = node.value == int(node.value) and int(node.value)
@@ -91,7 +98,7 @@ def is_on_a_face(name: str) -> bool:
 
 def strings_of(path: Path) -> Iterator[str]:
     """Yield the full names of modules in the strings of a test."""
-    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+    for node in nodes_of(path):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             text = re.sub(r'from (accel_calib[\w.]*) import (\w+)', r'\1.\2', node.value)
             yield from map(module_of, re.findall(r'accel_calib(?:\.\w+)*', text))
@@ -106,9 +113,9 @@ def test_tests_name_no_file_of_the_package() -> None:
 
 @pytest.mark.parametrize('path', GATHERED)
 def test_names_are_gathered_only_for_tests_that_use_them(path: Path) -> None:
-    tree = ast.parse(path.read_text(encoding='utf-8'))
-    nodes, of_classes = [*ast.walk(tree)], {
-        each for node in tree.body if isinstance(node, ast.ClassDef) for each in ast.walk(node)}
+    nodes = nodes_of(path)
+    of_classes = {each for node in nodes if isinstance(node, ast.ClassDef)
+                  for each in ast.walk(node)}
     imported = {each.asname or each.name for node in nodes if isinstance(node, ast.ImportFrom)
                 for each in node.names}
     names = [node for node in nodes if isinstance(node, ast.Name)]

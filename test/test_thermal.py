@@ -149,17 +149,6 @@ def test_fit_recovers_the_lag_within_its_uncertainty(effect, of_sensor, lag):
     assert (found[4], sd[4]) == (of_sensor, 0.0)
 
 
-def test_fit_leaves_a_lag_of_zero_as_it_is():
-    rng = np.random.default_rng(1)
-    context = {'temperature': rng.uniform(5.0, 45.0, 60)}
-    true = Model({'offset': np.full(3, 0.01), 'offset_temperature': np.full(3, 1e-3)})
-    poses = simulate_poses(true, random_directions(60, rng), rng, context=context)
-    fit = estimate(Model({'offset': np.zeros(3), 'offset_temperature': np.zeros(3)}), poses)
-    assert fit.model.fitted.tolist() == [True] * 6 + [False, False]
-    np.testing.assert_array_equal(fit.model.values['offset_temperature'][3:], 0.0)
-    np.testing.assert_array_equal(fit.covariance[6:], 0.0)
-
-
 def lagging(lag, of_sensor):
     """Return a model with a temperature that lags."""
     return Model({'offset_temperature': np.array([1e-3, 1e-3, 1e-3, lag, of_sensor])})

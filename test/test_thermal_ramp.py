@@ -33,7 +33,7 @@ import numpy as np
 import pytest
 from ramps import BENT, G, LINE, offset_at, ramp, twelve_poses, TWISTED, UP, warming, write_ulog
 from scipy.signal import medfilt
-from shared import data, MPS2, refused, rms, run, run_json
+from shared import MPS2, refused, rms, run, run_json
 from test_exports import qgroundcontrol
 from test_log_formats import make
 
@@ -246,36 +246,6 @@ def test_the_error_on_a_second_ramp_is_not_larger_than_that_of_the_autopilots(tr
                        for offset in offsets])
     ours, *theirs = np.mean(errors, axis=0)
     assert ours <= 1.02 * min(theirs)
-
-
-def bumped(seconds: float, change_g) -> Recording:
-    log = ramp(8)
-    later = (log['time'] > seconds)[:, np.newaxis]
-    return log.with_columns(reading=log.reading + later * np.array(change_g) * G)
-
-
-def test_a_jump_along_gravity_is_a_step_of_the_sensor_and_bends_no_curve():
-    stepped = curve(bumped(900.0, UP * 0.006))
-    assert set(stepped.model.effects) == {*OFFSET_POWERS[1:3], 'offset_step'}
-    *size, instant = stepped.model.values['offset_step']
-    assert instant == pytest.approx(900.0, abs=15.0)
-    np.testing.assert_allclose(size, UP * 0.006, atol=5e-4)
-    values, deviations = coefficients(stepped)
-    assert np.all(np.abs(values - BENT) < 5.0 * deviations)
-    made = thermal(bumped(900.0, UP * 0.006))
-    assert 'thermal_step' in {each.kind for each in made.rating.findings}
-
-
-def test_ramps_of_several_orientations_share_one_curve():
-    found = curve(ramp(5), ramp(6, up=np.array([1.0, 0.0, 0.0])))
-    assert found.degree == 2
-    values, deviations = coefficients(found)
-    assert np.all(np.abs(values - BENT) < 5.0 * deviations)
-
-
-def test_a_log_in_which_the_board_moved_is_refused(tmp_path, capsys):
-    path = data('sensehat_lsm9ds1_temperature.csv')
-    assert 'the board moved' in refused(capsys, 'thermal', path, '-o', tmp_path / 'd.yaml')
 
 
 def test_a_session_with_the_offset_over_temperature_alone_says_so(tmp_path: Path) -> None:

@@ -10,12 +10,11 @@ import re
 from typing import Any
 
 import accel_calib as ac
-from accel_calib.calibration import fit_poses
 from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, read_recording, write_table
 from accel_calib.stored import write_calibration
 from accel_calib.table import Poses, Table
-from accel_calib.units import STANDARD_GRAVITY as GRAVITY, Units, units_of
+from accel_calib.units import STANDARD_GRAVITY as GRAVITY, Units
 from bag_files import write_bag
 from golden.record import differences
 from inside import in_units_of, model_with, read_log, simulate_recording, spread_directions
@@ -39,13 +38,20 @@ def unstated(table: Table) -> Table:
 
 
 @pytest.mark.parametrize('units', METRIC)
-def test_conversion_is_exact_and_goes_back(units: str) -> None:
-    calibration = ac.fit(poses(units), model='10')
+def test_conversion_of_a_calibration_and_its_poses_is_exact_and_goes_back(units: str) -> None:
+    calibration = ac.fit(poses(units, reference=True, temperature=(20.0, 30.0)))
+    assert calibration.name == '12'
     there = calibration.in_units(other(units))
     factor = there.units.per_g / calibration.units.per_g
     reading = np.random.default_rng(2).normal(size=(20, 3)) * calibration.units.per_g
     np.testing.assert_allclose(there.correct(reading * factor),
                                calibration.correct(reading) * factor, rtol=1e-13)
+    assert there.poses.units == other(units)
+    for key, times in (('reading', factor), ('std', factor), ('reference', factor),
+                       ('count', 1.0), ('temperature', 1.0)):
+        np.testing.assert_allclose(there.poses[key], calibration.poses[key] * times, rtol=1e-13)
+    assert ac.verify(there.poses, calibration).rms_after_mg == pytest.approx(
+        ac.verify(calibration.poses, calibration).rms_after_mg, rel=1e-9)
     back = there.in_units(units)
     assert back.units == calibration.units
     np.testing.assert_allclose(back.poses.reading, calibration.poses.reading, rtol=1e-15)
@@ -107,34 +113,6 @@ def test_refine_starts_from_a_calibration_in_the_other_unit() -> None:
     np.testing.assert_allclose(found[0].gap_mg, found[1].gap_mg, rtol=1e-6)
     np.testing.assert_allclose(found[0].calibration.model.vector,
                                found[1].calibration.model.vector, rtol=1e-4, atol=1e-7)
-
-
-def test_compare_takes_calibrations_in_g_and_in_m_s2() -> None:
-    first, second = (ac.fit(poses('g', seed=seed), model='10') for seed in (1, 2))
-    expected = ac.compare([first, second])
-    found = ac.compare([first, second.in_units('m/s2')])
-    assert expected.agree
-    assert found.agree
-    assert found.p_value == pytest.approx(expected.p_value, rel=1e-6)
-    for one, two in zip(found.runs, expected.runs, strict=True):
-        assert one.rms_mg == pytest.approx(two.rms_mg, rel=1e-6)
-    changed = ac.fit(ac.simulate({**SENSOR, 'offset': (0.06, -0.03, 0.08)}, units='m/s2', seed=3,
-                                 noise=0.001), model='10')
-    assert not ac.compare([first, changed]).agree
-
-
-def test_poses_are_converted_with_their_noise_and_known_forces() -> None:
-    table = poses('g', reference=True, temperature=(20.0, 30.0))
-    calibration = fit_poses(table, units_of('g'))
-    found = calibration.in_units('m/s2').poses
-    assert found.units == 'm/s2'
-    for key in ('reading', 'std', 'reference'):
-        np.testing.assert_allclose(found[key], table[key] * GRAVITY)
-    for key in ('count', 'temperature'):
-        np.testing.assert_array_equal(found[key], table[key])
-    assert calibration.name == '12'
-    assert ac.verify(found, calibration).rms_after_mg == pytest.approx(
-        ac.verify(table, calibration).rms_after_mg, rel=1e-9)
 
 
 @pytest.mark.parametrize('stated', [True, False])

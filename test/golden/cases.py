@@ -118,7 +118,7 @@ def _of_yaml(stored: dict[str, Any]) -> dict[str, Any]:
              if key not in ('date', 'package_version', 'checksum', 'poses')}
     if 'covariance' in found and 'effects' in found:
         order = np.argsort([f'{effect}.{name}' for effect, parts in found['effects'].items()
-                            for name in parts if name not in ('what', 'unit')])
+                            for name in parts if name not in ('what', 'unit', 'own_rms')])
         found['covariance'] = np.array(found['covariance'])[np.ix_(order, order)]
     return found
 

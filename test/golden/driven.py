@@ -5,6 +5,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 import struct
 from typing import Any
 
@@ -32,9 +33,12 @@ class _Driver(Driver):
     """A session of which each step returns a result."""
 
     def __init__(self) -> None:
-        """Wait for the first step, which is `start`."""
+        """Wait for the first step, which is `start`; another one is a start anew."""
+        self.session: Any = None
 
     def start(self, **settings: Any) -> None:
+        if self.session is not None:
+            self.session.close()
         super().__init__('/imu', calibration_file='c.yaml', **settings)
 
     def end(self, answer: str) -> None:
@@ -59,6 +63,21 @@ class _Driver(Driver):
             self.handle()
         self.session.tick()
         self.handle()
+
+    def edit(self, old: str, new: str) -> None:
+        """Change the file of the calibration."""
+        path = Path('c.yaml')
+        path.write_text(path.read_text(encoding='utf-8').replace(old, new, 1), encoding='utf-8')
+
+    def kept(self) -> Any:
+        """Return the files, the directions of the poses, and the findings of the calibration."""
+        noted = [] if self.calibration is None else [each.kind for each in self.calibration.noted]
+        return [sorted(map(str, Path().iterdir())), np.round(self.poses.reading / G, 1), noted]
+
+    def frame(self) -> Any:
+        """Return the rotation that is applied to messages, and the gravity in them."""
+        return {'rotation': self.session.state.applied.rotation,
+                'gravity': self.session.state.gravity / G}
 
     def state(self) -> Any:
         """Return progress, diagnostics, checks and poses."""

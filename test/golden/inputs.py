@@ -24,7 +24,7 @@ def poses(path: Path, *, hidden: Mapping[str, float] | None = None, seed: int = 
           per_g: float = G, centre: float = 0.0, without: str = '', misplaced: float = -1.0,
           known_g: float = G, axes: Any = np.eye(3), shared: bool = False,
           wrong: Mapping[int, Any] = {}, copies: Mapping[int, int] = {}, cone: float = 180.0,
-          **setup: Any) -> None:
+          sensor: str = '', **setup: Any) -> None:
     """
     Write a pose table of the independent simulator.
 
@@ -32,7 +32,7 @@ def poses(path: Path, *, hidden: Mapping[str, float] | None = None, seed: int = 
     first letters of columns that are left out, ``misplaced`` the error of known orientations [°],
     ``known_g`` and ``axes`` their size and axes, ``shared`` whether repeated orientations are
     stated, ``wrong`` readings of rows or factors on them, ``copies`` rows that repeat others, and
-    ``cone`` the largest angle from z [°].
+    ``cone`` the largest angle from z [°]. ``sensor`` is the stated name.
 
     """
     rng = np.random.default_rng(seed)
@@ -57,6 +57,13 @@ def poses(path: Path, *, hidden: Mapping[str, float] | None = None, seed: int = 
             each[row - 1] = each[of - 1]
     kept = up[:, 2] >= np.cos(np.radians(cone))
     write_csv(path, {name: each[kept] for name, each in columns.items()})
+    _name(path, sensor)
+
+
+def _name(path: Path, sensor: str) -> None:
+    if sensor:
+        path.write_text(f'# sensor: "{sensor}"\n{path.read_text(encoding="utf-8")}',
+                        encoding='utf-8')
 
 
 def fleet(path: Path) -> None:
@@ -154,7 +161,7 @@ def _at_rest(part: Mapping[str, Any], up: Any, here: Any) -> tuple[Any, Any]:
 
 def recording(path: Path, *, parts: Sequence[Mapping[str, Any]] = (), per_g: float = G,
               vary: Mapping[str, Sequence[Any]] = {}, warming: float | None = None,
-              **options: Any) -> None:
+              sensor: str = '', **options: Any) -> None:
     """
     Write samples, by default of 14 sides; without a gyro if ``gyro`` is 0.
 
@@ -173,3 +180,4 @@ def recording(path: Path, *, parts: Sequence[Mapping[str, Any]] = (), per_g: flo
     if warming is not None:
         columns['temperature'] = 20.0 + warming * (table[:, 0] - table[0, 0]) / 60.0
     write_csv(path, columns)
+    _name(path, sensor)

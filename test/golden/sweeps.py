@@ -22,6 +22,7 @@ from accel_calib.table import check_units
 from accel_calib.units import FRAMES, units_of
 from golden.driven import messages
 from golden.figures import attempt, of_expected, of_fit, of_next_pose, those
+from golden.screens import screens
 from inside import (
     axes_of, believable, change, distinct, doubts_about_flat, equations, fault_of,
     find_undetermined, is_over, measured, missing_poses, Model, mounting, mounting_figures,
@@ -434,4 +435,4 @@ def near_models() -> Any:
 SWEEPS: dict[str, Callable[[], Any]] = {
     each.__name__: each for each in (
         directions, plans, noise, wiring, mountings, catalogue, gyro, changes, gates,
-        rated_effects, comparisons, priors, near_models, messages)}
+        rated_effects, comparisons, priors, near_models, messages, screens)}
