@@ -16,39 +16,13 @@ import zipfile
 
 from accel_calib.errors import InputError
 from accel_calib.fleet import recordings
-from accel_calib.logs import FORMATS, LogOptions, open_log, read_poses, SUFFIXES
+from accel_calib.logs import FORMATS, LogOptions, open_log, SUFFIXES
 from accel_calib.table import Recording
-from inside import model_with, read_log, simulate_recording, spread_directions
+from data.logs import make
+from inside import read_log, spread_directions
 import numpy as np
 import pytest
-from shared import data, GRAVITY as G, little_memory, LOG_CORPUS, options_of, run_json
-
-RATE_HZ = 100.0
-OFFSET = np.array([0.03, -0.02, 0.05])
-GAIN = np.array([1.01, 0.98, 1.02])
-NOISE = 0.002
-
-
-def samples(seed: int = 1, per_g: float = G, *, poses: int = 12, rest: int = 200, turn: int = 80
-            ) -> dict[str, np.ndarray]:
-    """Return time [s], readings with `per_g` to the g, and rates [rad/s] of a recording."""
-    rng = np.random.default_rng(seed)
-    made = simulate_recording(
-        model_with({'offset': OFFSET, 'axis_gain': GAIN - 1.0}),
-        spread_directions(poses)[rng.permutation(poses)], rng, noise_g=NOISE, rate_hz=RATE_HZ,
-        dwell=rest / RATE_HZ, turn=turn / RATE_HZ, gyro_noise=0.001)
-    return {'time': made['time'].copy(), 'reading': per_g * made.reading, 'rate': made['rate']}
-
-
-def rows_of(*columns: np.ndarray, digits: str = '.9g') -> list[list[str]]:
-    """Return the cells of rows, from columns of numbers."""
-    parts = [[[format(value, digits) for value in row]
-              for row in np.reshape(column, (len(column), -1)).tolist()] for column in columns]
-    return [[cell for part in row for cell in part] for row in zip(*parts, strict=True)]
-
-
-def text_of(rows: list[list[str]], header: str) -> str:
-    return '\n'.join([header, *map(','.join, rows)]) + '\n'
+from shared import data, little_memory, LOG_CORPUS, options_of, run_json
 
 
 def write(folder: Path, content: Any, name: str = 'log.csv') -> Path:
@@ -89,19 +63,20 @@ def test_a_table_of_100000_columns_is_read(tmp_path: Path) -> None:
 
 
 def test_more_rows_than_a_person_poses_are_samples(tmp_path: Path) -> None:
-    poses = G * spread_directions(1500)
+    path, poses = tmp_path / 'log.csv', 9.80665 * spread_directions(1500)
+    np.savetxt(path, poses, delimiter=',', header='ax,ay,az', comments='')
     with pytest.raises(InputError, match='look like samples'):
-        read_log(write(tmp_path, text_of(rows_of(poses), 'ax,ay,az')))
-    timed = rows_of(np.arange(1500) * 5.0, poses)
-    log = read_log(write(tmp_path, text_of(timed, 'time,ax,ay,az')))
-    assert isinstance(log.table, Recording)
+        read_log(path)
+    np.savetxt(path, np.column_stack([np.arange(1500) * 5.0, poses]), delimiter=',',
+               header='time,ax,ay,az', comments='')
+    assert isinstance(read_log(path).table, Recording)
 
 
 def test_a_long_log_is_read_in_blocks_of_flat_memory_as_at_once(tmp_path: Path) -> None:
-    block = rows_of(samples(per_g=1000.0, poses=10, rest=400, turn=100)['reading'], digits='.6g')
+    block = np.round(1000.0 * make.recording(1, rate_hz=100.0).reading, 3).tolist()
     peaks = []
     for times in (40, 100):
-        lines = [f'{10 * k},{",".join(row)}\n' for k, row in enumerate(block * times)]
+        lines = [f'{10 * k},{x},{y},{z}\n' for k, (x, y, z) in enumerate(block * times)]
         path = write(tmp_path, ''.join(['millis,accX,accY,accZ\n', *lines]))
         tracemalloc.start()
         with open_log(path) as log:
@@ -193,29 +168,3 @@ def test_logs_of_others_become_poses(name: str, poses: int, tmp_path: Path,
     path = data(f'logs/{name}')
     _, made = run_json(capsys, 'capture', path, '-o', tmp_path / 'poses.csv')
     assert made['poses'] == poses
-
-
-@pytest.mark.parametrize(('scale', 'zero', 'empty', 'read', 'words'), [
-    (1.0, 0.0, 0, True, ''), (1.0, 273.15, 0, False, 'about 29'), (1000.0, 0.0, 0, False, 'about'),
-    (340.0, -36.53, 0, False, 'about -'), (1.0, 0.0, 3, False, '3 of 24 cells')])
-def test_a_temperature_that_is_not_in_degrees_or_has_holes_is_left_out_by_name(
-        tmp_path, scale, zero, empty, read, words):
-    rng = np.random.default_rng(5)
-    temperature = scale * (rng.uniform(15.0, 35.0, 24) + zero)
-    rows = rows_of(G * spread_directions(24), temperature, np.full(24, 100))
-    for row in rng.permutation(24)[:empty]:
-        rows[row][3] = ''
-    poses = read_poses(write(tmp_path, text_of(rows, 'ax,ay,az,temperature,count')))
-    assert ('temperature' in poses) is read
-    assert [words in each.text for each in poses.findings] == [True] * (not read)
-
-
-@pytest.mark.parametrize(('order', 'words'), [
-    (lambda time, rng: np.zeros(len(time)), 'are equal'),
-    (lambda time, rng: rng.permutation(time), 'before that of the row above')])
-def test_times_that_are_no_clock_are_named_before_anything_is_captured(tmp_path, order, words):
-    made = samples(poses=3)
-    time = order(made['time'], np.random.default_rng(4))
-    path = write(tmp_path, text_of(rows_of(time, made['reading']), 'time,ax,ay,az'))
-    with pytest.raises(InputError, match=words):
-        read_log(path)
