@@ -303,6 +303,8 @@ def test_a_bag_is_corrected_with_a_named_temperature(tmp_path: Path) -> None:
     with pytest.raises(InputError, match='name the topic with'):
         correct_bag(BAG, thermal, out)
     notes: list[str] = []
+    assert correct_bag(BAG, known('g'), tmp_path / 'plain', note=notes.append) == SAMPLES
+    assert notes == []  # this one needs no temperature
     assert correct_bag(BAG, thermal, out, WARM, note=notes.append) == SAMPLES
     assert len(notes) == 1  # the temperatures have no stamp
     raw, found = read_log(BAG, WARM).table, read_recording(out)
@@ -315,12 +317,6 @@ def test_a_bag_is_corrected_with_a_named_temperature(tmp_path: Path) -> None:
     given = 'apply', BAG, '-c', tmp_path / 'c.yaml', '-o', tmp_path / 'other'
     assert run(*given) == 2
     assert run(*given, '--context', 'temperature:=/imu/temp') == 0
-
-
-def test_a_calibration_without_temperature_needs_no_topic(tmp_path: Path) -> None:
-    notes: list[str] = []
-    assert correct_bag(BAG, known('g'), tmp_path / 'out', note=notes.append) == SAMPLES
-    assert notes == []
 
 
 # Bags of killed recorders, and full disks
@@ -336,13 +332,14 @@ def test_the_messages_in_the_journal_of_a_killed_recorder_are_read(tmp_path: Pat
     path = Path(shutil.copytree(made, tmp_path / 'killed'))
     database.close()
     (path / 'bag.db3-shm').unlink()
-    before = {each.name: each.read_bytes() for each in path.iterdir()}
+    before = {each: (each.read_bytes(), each.stat().st_mtime_ns) for each in path.iterdir()}
     for each in (path, path / 'bag.db3'):
         log = read_log(each)
         assert len(log.table) == 2 * FEW
         assert 'its last messages are read from bag.db3-wal' in log.notes[0]
     assert correct_bag(path, known(), tmp_path / 'out') == 2 * FEW
-    assert {each.name: each.read_bytes() for each in path.iterdir()} == before
+    assert before == {
+        each: (each.read_bytes(), each.stat().st_mtime_ns) for each in path.iterdir()}
 
 
 @pytest.mark.parametrize('name', ['run #1', 'what?', '100%20'])

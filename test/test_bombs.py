@@ -77,7 +77,7 @@ def test_data_that_compress_well_are_read(tmp_path: Path) -> None:
     assert correct_bag(path, known(), tmp_path / 'out') == COUNT
 
 
-def test_correcting_leaves_a_database_as_it_is_and_refuses_a_copy_that_lacks_messages(
+def test_a_copy_that_lacks_messages_is_refused(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write, count = rosbag2.Writer.write, iter(range(10 ** 6))
 
@@ -86,17 +86,10 @@ def test_correcting_leaves_a_database_as_it_is_and_refuses_a_copy_that_lacks_mes
             write(self, *message)
 
     path = folder_of(StoragePlugin.SQLITE3)(tmp_path)
-
-    def state() -> dict[Path, Any]:
-        return {each: (each.read_bytes(), each.stat().st_mtime_ns) for each in path.iterdir()}
-
-    before = state()
-    assert correct_bag(path, known(), tmp_path / 'whole') == COUNT
-    assert state() == before
     monkeypatch.setattr(rosbag2.Writer, 'write', losing)
     with pytest.raises(InputError, match='the copy holds 83 of 84 messages'):
         correct_bag(path, known(), tmp_path / 'out')
-    assert sorted(each.name for each in tmp_path.iterdir()) == ['bag', 'whole']
+    assert [*tmp_path.iterdir()] == [path]
 
 
 # ----------------------------------------------------------------------------- regular files

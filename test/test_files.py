@@ -22,7 +22,7 @@ from accel_calib.effects import OwnEffect
 from accel_calib.errors import (
     AccelCalibError, DamagedCalibrationError, InputError, StoredCalibrationError)
 from accel_calib.finding import has
-from accel_calib.logs import read_poses, read_recording, write_table
+from accel_calib.logs import read_poses, write_table
 from accel_calib.stored import read_calibration, read_prior, write_calibration
 from accel_calib.table import COLUMNS, numbered, Poses
 from faults.fuzz import LONGEST_LINE
@@ -34,12 +34,6 @@ import numpy as np
 import pytest
 from shared import G, sensor, table, with_effects
 import yaml
-
-
-def write(folder, text):
-    path = folder / 'table.csv'
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return path
 
 
 def every_column(count=4):
@@ -61,13 +55,6 @@ def test_every_column_is_read_as_it_was_written(tmp_path):
     for key in table.columns.keys() - {'label'}:
         np.testing.assert_allclose(found[key], table[key], rtol=1e-11)
     np.testing.assert_allclose(np.diff(found['time']), 0.0025, atol=5e-7)
-
-
-def test_a_recording_needs_times_and_a_missing_file_is_an_error_of_the_system(tmp_path):
-    with pytest.raises(InputError, match='no column time'):
-        read_recording(write(tmp_path, 'ax,ay,az\n1,2,3\n4,5,6\n'))
-    with pytest.raises(FileNotFoundError):
-        read_poses(tmp_path / 'none.csv')
 
 
 @pytest.fixture(params=['4', '9', '10', '12'])
@@ -244,12 +231,6 @@ def test_the_size_of_a_file_is_bounded_before_it_is_parsed(
     os.mkfifo(tmp_path / 'pipe')
     with pytest.raises(InputError, match='is a pipe'):
         read(tmp_path / 'pipe')
-
-
-def test_another_format_of_typical_values_is_refused_in_one_line(tmp_path: Path) -> None:
-    (tmp_path / 'fleet.yaml').write_text('format: "a\\nb"\n')
-    with pytest.raises(InputError, match=r"has format 'a b', expected 1"):
-        read_prior(tmp_path / 'fleet.yaml')
 
 
 def with_poses(count: int) -> Calibration:

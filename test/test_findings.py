@@ -1,21 +1,31 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Findings, the rating, which says what to do, and the next step, the same on all surfaces."""
+"""
+What is refused, what is found, and what to do next, the same on all surfaces.
+
+Bad rows, absurd numbers and edited files never lead to a wrong calibration.
+
+"""
 
 from dataclasses import replace
 import json
+from pathlib import Path
 import shlex
 
 import accel_calib as ac
-from accel_calib.calibration import fit_partial, mounting_only, Rejected
+from accel_calib.calibration import fit_partial, fit_poses, gated, mounting_only, Rejected
+from accel_calib.errors import RefusedFitError
 from accel_calib.finding import Finding, KINDS, NextStep, rated, without
 from accel_calib.findings import Expected, GOOD_MG, rate, rate_comparison, rate_verification
 from accel_calib.logs import write_table
-from inside import main, model_with, spread_directions
+from accel_calib.stored import OF_FILE, read_calibration
+from inside import (
+    format_calibration, main, Model, model_with, parse_calibration, simulate_poses,
+    spread_directions)
 import numpy as np
 import pytest
-from shared import changed, error_mg, FACES, MPS2, random_directions
+from shared import changed, error_mg, FACES, G, MPS2, poses_of, random_directions, sensor, table
 
 TIME = 20.0 * np.arange(30)
 WARM = 27.0 + 3.5 * np.sin(TIME / 60.0)
@@ -243,3 +253,79 @@ def test_after_a_search_without_result_nobody_is_sent_to_search_again(noise_know
     assert (first['rating'], first['next']['kind']) == ('USABLE', 'refine')
     again = result_of(first['next']['command'], tmp_path)
     assert (again['rating'], again['next']['kind']) == ('USABLE', 'poses')
+
+
+# The gate: bad rows, absurd numbers and edited files
+
+
+STORED, TWELVE = Path(__file__).parent / 'data', table('twelve_readings')
+
+
+@pytest.mark.parametrize('row', [
+    (0.0, 0.0, 0.0), *((7.6, value, 6.2) for value in (1e150, -1e300, 1e20, 1e6))])
+@pytest.mark.parametrize('model', ['auto', '4', '7', '9', '10'])
+def test_an_impossible_reading_is_left_out_and_named(model, row):
+    expected = fit_poses(poses_of(TWELVE), MPS2, model=model)
+    found = fit_poses(poses_of([*TWELVE, row]), MPS2, model=model)
+    assert [each.row for each in found.rejected] == [13]
+    np.testing.assert_allclose(found.offset, expected.offset, rtol=1e-6)
+    np.testing.assert_allclose(found.gain, expected.gain, rtol=1e-6)
+
+
+@pytest.mark.parametrize('absurd', [
+    {'std': 1e300}, {'std': 1e150}, {'std': 1e5}, {'reading': 1e6, 'std': 1e6}])
+def test_an_absurd_deviation_is_left_out_and_named(absurd):
+    poses = simulate_poses(sensor(np.random.default_rng(1)), spread_directions(14),
+                           np.random.default_rng(2))
+    columns = {key: poses[key].copy() for key in absurd}
+    for key, value in absurd.items():
+        columns[key][5] = value
+    found = fit_poses(poses.with_columns(**columns), G)
+    (rejected,) = found.rejected
+    assert rejected.row == 6
+    assert 'reading' in absurd or 'not at rest' in rejected.reason
+
+
+@pytest.fixture(scope='module')
+def calibration():
+    poses = simulate_poses(sensor(np.random.default_rng(5)), spread_directions(14),
+                           np.random.default_rng(6))
+    return fit_poses(poses, G, model='10', sensor='imu')
+
+
+@pytest.mark.parametrize('values', table('overflowing_effects'))
+def test_values_that_overflow_and_a_residual_that_is_no_number_are_refused(values, calibration):
+    model = Model({name: np.array(part) for name, part in {
+        **calibration.model.values, **values}.items()})
+    covariance = np.zeros((len(model.vector),) * 2)
+    with pytest.raises(RefusedFitError):
+        gated(replace(calibration, model=model, covariance=covariance))
+    with pytest.raises(RefusedFitError, match='the residual is nan mg'):
+        gated(replace(calibration, quality=replace(calibration.quality, rms_after_mg=np.nan)))
+
+
+def test_a_file_edited_by_hand_is_used_with_a_warning_and_its_effects_count(calibration):
+    text, matrix = format_calibration(calibration), calibration.matrix
+    for old, new, kinds in (
+            ('sensor: imu', 'sensor: imu', []), ('sensor: imu', 'sensor: other', ['edited']),
+            (f'[{matrix[0, 0]!s},', '[1.5,', ['edited', 'correction_in_file'])):
+        assert old in text
+        found = parse_calibration(text.replace(old, new, 1), 'x.yaml')
+        assert [each.kind for each in found.noted if each.kind in OF_FILE] == kinds
+        np.testing.assert_array_equal(found.matrix, matrix)
+        assert found.sensor == ('other' if 'other' in new else 'imu')
+        again = parse_calibration(format_calibration(found), 'x.yaml')
+        assert not {each.kind for each in again.noted} & {*OF_FILE}
+
+
+def test_stored_calibrations_still_load_and_correct_as_they_did():
+    corrected = json.loads((STORED / 'calibration_corrected.json').read_text())
+    assert len(corrected) == 4
+    context = {'temperature': np.array([22.0]), 'time': np.array([600.0])}
+    for name, force in corrected.items():
+        found = read_calibration(STORED / name)
+        reading = np.array([[0.3, -0.4, 0.8]]) * found.units.per_g
+        np.testing.assert_allclose(found.correct(reading, context)[0], force, rtol=1e-9)
+        assert np.all(np.isfinite(found.covariance))
+        assert parse_calibration(format_calibration(found), name).model.effects == (
+            found.model.effects)
