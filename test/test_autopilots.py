@@ -4,13 +4,12 @@
 """
 From the log of an autopilot to its parameters, with any rotation of the board and old calibration.
 
-The firmware stands here as its own formula (`Firmware.corrected`): the readings of a sensor become
-those of a log, the log becomes a calibration and its export, and the exported parameters correct
-the readings of the sensor.
+The readings of a sensor become those of a log by the equations of the firmware, the log becomes a
+calibration and its export, and the exported parameters correct the readings of the sensor.
 
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 import re
@@ -27,7 +26,7 @@ from inside import (
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from test_exports import ardupilot, by_autopilot, qgroundcontrol
+from test_exports import ardupilot, ardupilot_force, by_autopilot, px4_force, qgroundcontrol
 from test_log_formats import make
 
 mavlink = pytest.importorskip('pymavlink.dialects.v20.common')
@@ -67,10 +66,9 @@ def raw() -> Recording:
                               temperatures=(18.0, 42.0))
 
 
-def logged(raw: Recording, rotation: Any, thermal: Callable[[Any], Any] = lambda warm: 0.0
-           ) -> Recording:
-    """Return what the firmware logs of these readings [g]: corrected, and then turned."""
-    corrected = (raw.reading * G - thermal(raw['temperature']) - OLD[0]) * OLD[1]
+def logged(raw: Recording, rotation: Any, corrected: Any = None) -> Recording:
+    """Return what the firmware logs of these readings [g]: corrected [m/s²], and then turned."""
+    corrected = (raw.reading * G - OLD[0]) * OLD[1] if corrected is None else corrected
     return raw.with_columns(reading=corrected @ rotation.T / G, rate=raw['rate'] @ rotation.T)
 
 
@@ -186,27 +184,18 @@ def test_what_is_not_known_stays_with_the_readings_up_to_the_export(parameters, 
     assert why in ' '.join(said.split())
 
 
-def thermal_ardupilot(warm: Any, zero: float = 28.0) -> Any:
-    """Return the polynomial of ArduPilot with the parameters `THERMAL` [m/s²]; 0 at a value."""
-    def at(value: Any) -> Any:
-        change = np.atleast_1d(np.clip(value, 20.0, 40.0) - 35.0)[:, np.newaxis]
-        return (change * [3000.0, -2000.0, 1000.0] + change ** 2 * [50.0, 0.0, -70.0]) * 1e-6
-
-    return at(warm) - at(zero)
-
-
 THERMAL = {'INS_TCAL1_ENABLE': 1.0, 'INS_TCAL1_TMIN': 20.0, 'INS_TCAL1_TMAX': 40.0,
            'INS_ACC1_CALTEMP': 28.0, **three('INS_TCAL1_ACC1_', '', [3000.0, -2000.0, 1000.0]),
-           **three('INS_TCAL1_ACC2_', '', [50.0, 0.0, -70.0])}
+           **three('INS_TCAL1_ACC2_', '', [50.0, 0.0, -70.0]),
+           **three('INS_TCAL1_ACC3_', '', np.zeros(3))}
 
 
-@pytest.mark.parametrize('zero', [28.0, -300.0])
-def test_an_old_thermal_calibration_of_ardupilot_is_undone_and_replaced(zero, raw, tmp_path):
-    old = {**old_ardupilot(1), **THERMAL}
-    if zero < 0.0:
-        del old['INS_ACC1_CALTEMP']  # the default of the firmware is -300
-    path = ardupilot_log(tmp_path / 'log.bin', logged(
-        raw, named('YAW_45'), lambda warm: thermal_ardupilot(warm, zero)), old)
+@pytest.mark.parametrize('lacks', ['', 'INS_ACC1_CALTEMP'])  # the default of the firmware: -300
+def test_an_old_thermal_calibration_of_ardupilot_is_undone_and_replaced(lacks, raw, tmp_path):
+    whole = {**old_ardupilot(1), **THERMAL, **({lacks: -300.0} if lacks else {})}
+    corrected = ardupilot_force(whole, raw.reading * G, raw['temperature'])
+    old = {name: value for name, value in whole.items() if name != lacks}
+    path = ardupilot_log(tmp_path / 'log.bin', logged(raw, named('YAW_45'), corrected), old)
     undone(path, raw)
     made = calibrated(path)
     check_exported(made, 'ardupilot', raw, tmp_path)
@@ -218,15 +207,12 @@ def test_an_old_thermal_calibration_of_px4_is_undone_and_replaced(raw, tmp_path)
     orders = np.array([[0.03, -0.01, 0.02], [3e-3, -2e-3, 1e-3], [5e-5, 0.0, -7e-5],
                        [1e-6, 2e-6, 0.0]])
 
-    def thermal(warm: Any) -> Any:
-        change = (np.clip(warm, 20.0, 40.0) - 30.0)[:, np.newaxis]
-        return sum(change ** k * part for k, part in enumerate(orders))
-
     old = {**old_px4(6), 'TC_A_ENABLE': 1, 'TC_A2_ID': DEVICE, 'TC_A2_TREF': 30.0,
            'TC_A2_TMIN': 20.0, 'TC_A2_TMAX': 40.0,
            **{f'TC_A2_X{k}_{axis}': float(part[axis]) for k, part in enumerate(orders)
               for axis in range(3)}}
-    path = px4_log(tmp_path / 'log.ulg', logged(raw, named('YAW_270'), thermal), old)
+    corrected = px4_force(old, raw.reading * G, raw['temperature'], 1, thermal=2)
+    path = px4_log(tmp_path / 'log.ulg', logged(raw, named('YAW_270'), corrected), old)
     undone(path, raw, atol=2e-3)
     found = qgroundcontrol(export(calibrated(path), 'px4').text_or_bytes)
     assert found['TC_A2_ID'] == DEVICE

@@ -156,12 +156,12 @@ def qgroundcontrol(text):
     return {row[2]: float(row[3]) for row in rows}
 
 
-def px4_force(found, reading, temperature, instance=0):
+def px4_force(found, reading, temperature, instance=0, thermal=None):
     """Correct readings by the equation of PX4 [m/s²]."""
     def three(pattern):
         return np.array([found[pattern.format(axis)] for axis in 'XYZ'])
 
-    prefix, thermal = f'CAL_ACC{instance}_', f'TC_A{instance}_'
+    prefix, thermal = f'CAL_ACC{instance}_', f'TC_A{instance if thermal is None else thermal}_'
     moved = np.zeros_like(reading)
     if found.get('TC_A_ENABLE'):
         change = np.clip(temperature, found[f'{thermal}TMIN'], found[f'{thermal}TMAX'])
