@@ -21,13 +21,13 @@ from accel_calib.logs import write_table
 from accel_calib.stillness import capture
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Autopilot, Recording
+from data.logs import make
 from inside import (
     export, ExportOptions, main, model_with, read_log, simulate_recording, spread_directions)
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from test_exports import ardupilot, ardupilot_force, by_autopilot, px4_force, qgroundcontrol
-from test_log_formats import make
 
 mavlink = pytest.importorskip('pymavlink.dialects.v20.common')
 pytest.importorskip('pyulog')

@@ -4,6 +4,8 @@
 """
 Large and hostile logs, and a small log in each format, which is read as the same table.
 
+Samples of the makers' layouts are read, captured and fitted, and the truth is found.
+
 The golden cases `logs_…` read small ones of all dialects, what is refused, and what is special.
 
 """
@@ -11,28 +13,26 @@ The golden cases `logs_…` read small ones of all dialects, what is refused, an
 from pathlib import Path
 import sys
 import tracemalloc
-from typing import Any
 import zipfile
 
+from accel_calib.calibration import fit_poses, level_by_rows
 from accel_calib.errors import InputError
 from accel_calib.fleet import recordings
 from accel_calib.logs import FORMATS, LogOptions, open_log, SUFFIXES
+from accel_calib.stillness import capture
 from accel_calib.table import Recording
 from data.logs import make
 from inside import read_log, spread_directions
 import numpy as np
 import pytest
-from shared import data, little_memory, LOG_CORPUS, options_of, run_json
+from shared import data, little_memory, LOG_CORPUS, LOGS, options_of, run_json
+
+WITHIN_SD = 5.0
 
 
-def write(folder: Path, content: Any, name: str = 'log.csv') -> Path:
-    """Write text, bytes, or what a function of the path writes."""
-    path = folder / name
-    if callable(content):
-        content(path)
-    else:
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
-    return path
+def write(folder: Path, text: str) -> Path:
+    (folder / 'log.csv').write_text(text, encoding='utf-8')
+    return folder / 'log.csv'
 
 
 def test_a_cut_last_line_is_left_out_and_noted_also_alone_in_its_block(tmp_path: Path) -> None:
@@ -168,3 +168,41 @@ def test_logs_of_others_become_poses(name: str, poses: int, tmp_path: Path,
     path = data(f'logs/{name}')
     _, made = run_json(capsys, 'capture', path, '-o', tmp_path / 'poses.csv')
     assert made['poses'] == poses
+
+
+# Samples of the makers' layouts
+
+
+@pytest.mark.parametrize('name', make.TRUTHS)
+def test_the_truth_of_a_sample_is_found_without_options_and_with_its_format(name: str) -> None:
+    for end, library in (('.ulg', 'pyulog'), ('.bin', 'pymavlink'), ('.xls', 'xlrd')):
+        if name.endswith(end):
+            pytest.importorskip(library)
+    log, truth = read_log(LOGS / name), make.TRUTHS[name]
+    assert isinstance(log.table, Recording)
+    poses = capture(log.table, log.units).poses
+    assert (log.units.name, len(poses)) == (truth.units, make.POSES)
+    fitted = fit_poses(poses, log.units, model='10')
+    assert np.all(np.abs(fitted.offset - truth.offset) < WITHIN_SD * fitted.offset_sd)
+    assert np.all(np.abs(fitted.gain - truth.gain) < WITHIN_SD * fitted.gain_sd)
+    assert ('temperature' in log.table) == truth.temperature
+    if truth.rate:
+        assert np.ptp(log.table['rate'], axis=0).max() > 1.0  # rad/s, in the turns
+        assert np.abs(np.median(log.table['rate'], axis=0)).max() < 0.01
+    if truth.temperature:
+        assert np.ptp(log.table['temperature']) == pytest.approx(np.ptp(make.WARM), rel=0.05)
+    assert log.table['time'][-1] - log.table['time'][0] == pytest.approx(44.75, abs=0.01)
+    named = read_log(LOGS / name, LogOptions(format=name.split('/')[0]))
+    assert named.units == log.units
+    np.testing.assert_allclose(named.table.reading, log.table.reading, rtol=1e-12)
+    np.testing.assert_allclose(named.table['time'], log.table['time'], rtol=1e-12)
+
+
+def test_a_flat_pose_makes_a_level_vehicle_read_up() -> None:
+    log = read_log(LOGS / 'px4/log_sensor_accel_0.csv')
+    poses = capture(log.table, log.units).poses  # type: ignore[arg-type]
+    fitted = fit_poses(poses, log.units, model='10')
+    calibration = level_by_rows(fitted, poses, 'ros', 1, None)
+    up = calibration.apply(poses.reading[:1])[0] / log.units.per_g
+    np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=2e-3)
+    np.testing.assert_allclose(calibration.rotation, make.FRD, atol=2e-2)

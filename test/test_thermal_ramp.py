@@ -25,6 +25,7 @@ from accel_calib.stillness import cells_of, Ramp, ramp_of
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Recording
 from accel_calib.units import MG
+from data.logs import make
 from faults.sample import sample
 from inside import Intake, RampIntake, thermally_calibrated
 import numpy as np
@@ -33,7 +34,6 @@ from ramps import BENT, G, LINE, offset_at, ramp, twelve_poses, TWISTED, UP, war
 from scipy.signal import medfilt
 from shared import data, MPS2, refused, rms, run, run_json
 from test_exports import qgroundcontrol
-from test_log_formats import make
 
 
 def stretches(log: Recording) -> Ramp:
