@@ -6,7 +6,7 @@ import re
 
 from accel_calib.calibration import (
     dilution, error_left_in, fit_poses, flat_direction, identifiability, next_pose)
-from accel_calib.errors import InputError, RefusedFitError
+from accel_calib.errors import RefusedFitError
 from accel_calib.findings import request_words
 from accel_calib.geometry import angle_of, sphere_through
 from accel_calib.table import Poses
@@ -187,14 +187,6 @@ def test_levelling_again_keeps_the_heading():
     assert np.linalg.det(found) == pytest.approx(1.0)
     assert angle_of(found.T @ before) < 4.0
     np.testing.assert_array_equal(with_heading_of(before, upright), upright)
-
-
-def test_a_second_pose_near_the_first_and_a_flat_pose_without_gravity_are_refused():
-    with pytest.raises(InputError, match='within 10° of the flat pose'):
-        with_heading(np.eye(3), np.array([0, 0.05, 1.0]))
-    for flat in ((0, 0, 0), (np.nan, 0, 1)):
-        with pytest.raises(InputError, match='expected about 1 g'):
-            mounting(np.array(flat, float))
 
 
 def wired(mat_p, seed=1):
