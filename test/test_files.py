@@ -80,24 +80,6 @@ def test_a_stored_calibration_is_read_with_all_digits_and_the_previous_one_is_ke
     np.testing.assert_array_equal(found.gain_sd, calibration.gain_sd)
 
 
-@pytest.mark.parametrize(('values', 'text'), [
-    ([1e-3, 2e-3, -1e-3], 'x: 0.001, y: 0.002, z: -0.001}'),
-    ([1e-3, 2e-3, -1e-3, 60.0, 0.0], 'z: -0.001, lag: 60.0}'),
-    ([1e-3, 2e-3, -1e-3, 60.0, 1.0], 'z: -0.001, lag: 60.0, of_sensor: 1.0}')])
-def test_shape_at_its_usual_value_is_not_stored(values, text, calibration):
-    model = Model({**calibration.model.values, 'offset_temperature': np.array(values)})
-    size = len(calibration.covariance) + (4 if len(values) == 5 else 3) + (values[-1] == 1.0)
-    root = np.random.default_rng(1).normal(size=(size, size)) * 1e-6
-    given = replace(calibration, model=model, covariance=root @ root.T)
-    stored = format_calibration(given)
-    assert text in ' '.join(stored.split())
-    found = parse_calibration(stored, 'calibration.yaml')
-    np.testing.assert_array_equal(found.model.vector, model.vector)
-    np.testing.assert_array_equal(found.covariance, given.covariance)
-    again = format_calibration(found)
-    assert format_calibration(parse_calibration(again, 'calibration.yaml')) == again
-
-
 def put(path, text='new\n'):
     write_atomically(path, lambda file: file.write(text))
 
