@@ -4,7 +4,6 @@
 """Calibrations, or rests, of one sensor agree, and those of a changed sensor do not."""
 
 from dataclasses import replace
-import re
 from typing import Any
 
 from accel_calib.calibration import Calibration, fit_poses
@@ -14,9 +13,7 @@ from accel_calib.logs import read_recording
 from accel_calib.stillness import capture
 from accel_calib.table import Floats, Poses
 from accel_calib.units import units_of
-from inside import (
-    DRIFT_MEMORY, model_with, predict, rotation_free, simulate_poses, spread_directions, unit,
-    with_vector)
+from inside import DRIFT_MEMORY, model_with, predict, simulate_poses, spread_directions, unit
 import numpy as np
 import pytest
 from shared import attitudes, data, FACES, G, random_directions, sensor
@@ -92,20 +89,6 @@ def test_a_change_of_1_mg_in_one_run_is_found_and_the_run_is_named(axis):
     assert min(found.runs, key=lambda run: run.p_value) is found.runs[3]
     assert abs(found.runs[3].direction[axis]) > 0.8
     assert found.runs[3].largest_mg == pytest.approx(1.0, abs=0.6)
-
-
-@pytest.mark.parametrize('per_g', [1.0, 4.0])
-def test_slope_of_the_rotation_free_parameters_is_their_derivative(per_g):
-    rng = np.random.default_rng(4)
-    directions = spread_directions(12)
-    poses = simulate_poses(sensor(rng, 'offset', 'axis_gain', 'cross_axis', 'misalignment'),
-                           directions, rng, context={'reference': directions})
-    run = fit_poses(poses, G)
-    free = rotation_free(run, {}, per_g)
-    for step, column in zip(1e-6 * np.eye(len(run.model.vector)), free.slope.T, strict=True):
-        moved = replace(run, model=with_vector(run.model.effects, run.model.vector + step))
-        change = (rotation_free(moved, {}, per_g).values - free.values) / 1e-6
-        np.testing.assert_allclose(change, column, atol=1e-5)
 
 
 def test_runs_at_other_temperatures_agree_when_they_correct_for_it():
@@ -251,17 +234,6 @@ def test_changes_too_small_to_matter_are_ignored() -> None:
     watched = Watched(8, poses=60, noise=0.0001)
     assert watched.rest([UP] * 20, 0.0008 * UP).change is None
     assert watched.rest([UP] * 20, 0.0016 * UP).change is not None
-
-
-@pytest.mark.parametrize(('temperature', 'asked'), [
-    (38.2, ['38.2', '24.0', '25.3', '~/refine']), (26.0, ['~/reset', '~/fit']),
-    (np.nan, ['~/reset', '~/fit'])])
-def test_advice_names_the_temperature_where_it_changed(temperature: float, asked: list[str]
-                                                       ) -> None:
-    watched = Watched(9, temperature=np.linspace(24.0, 25.3, 12))
-    watched.rest([UP] * 4, temperature=temperature)
-    line = status(watched.rest([UP] * 3, -0.005 * UP, temperature=temperature))
-    assert re.findall(r'\d+\.\d(?= (?:°C|to))|~/\w+', line) == asked
 
 
 @pytest.mark.parametrize(('name', 'unit_name'), [
