@@ -56,17 +56,6 @@ def bag_of_ros_1(recording, tmp_path_factory):
     return path, poses, fit_poses(poses, MPS2, sensor='imu_link')
 
 
-@pytest.mark.parametrize('file', ['x.bag', 'x.mcap', 'x.db3'])
-def test_what_is_not_a_bag_is_refused_in_one_line(file, tmp_path):
-    with pytest.raises(InputError, match='is a folder without a bag'):
-        read_recording(tmp_path)
-    with pytest.raises(FileNotFoundError):
-        read_recording(tmp_path / file)
-    (tmp_path / file).write_bytes(b'not a bag at all')
-    with pytest.raises(InputError, match='is damaged'):
-        read_recording(tmp_path / file)
-
-
 def check_copy(path, copy, topic, calibration):
     """Check that a copy differs only in an Imu topic, and there by the calibration."""
     turned, rotation = calibration.is_levelled, calibration.rotation

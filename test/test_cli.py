@@ -20,8 +20,8 @@ from inside import (
 import numpy as np
 import pytest
 from shared import (
-    data, forked, LOGS, MPS2, OPTIONS, python, random_directions, refused, run, run_json,
-    run_on_small_disk, SENSOR, table)
+    data, forked, LOG_CORPUS, LOGS, MPS2, OPTIONS, python, random_directions, refused, run,
+    run_json, run_on_small_disk, SENSOR, table)
 
 
 @pytest.fixture(scope='module')
@@ -220,7 +220,9 @@ def test_the_report_has_a_page_and_figures(poses, tmp_path):
 @pytest.mark.parametrize(('module', 'line'), [
     ('matplotlib', 'refine poses.csv --report r.html'), ('aiohttp', 'live poses.csv'),
     ('pyulog', f'capture {LOGS}/px4/default.ulg -o p.csv'),
-    ('pymavlink', f'capture {LOGS}/ardupilot/two_imus.bin -o p.csv')])
+    ('pymavlink', f'capture {LOGS}/ardupilot/two_imus.bin -o p.csv'),
+    *((module, f'capture {next((LOG_CORPUS / "formats").glob(f"*{suffix}"))} -o p.csv')
+      for module, suffix in (('h5py', '.h5'), ('pyarrow', '.feather')))])
 def test_a_missing_library_is_named_in_one_line_with_how_to_install_it(module, line, poses, capsys,
                                                                        monkeypatch):
     monkeypatch.chdir(poses.parent)

@@ -14,7 +14,7 @@ from pathlib import Path
 import shlex
 
 import accel_calib as ac
-from accel_calib.calibration import fit_partial, fit_poses, gated, mounting_only, Rejected
+from accel_calib.calibration import fit_poses, gated, Rejected
 from accel_calib.errors import RefusedFitError
 from accel_calib.finding import Finding, KINDS, NextStep, rated, without
 from accel_calib.findings import Expected, GOOD_MG, rate, rate_comparison, rate_verification
@@ -142,18 +142,6 @@ def test_a_fit_beside_a_refused_refinement_is_not_bad():
     assert rate(refused.calibration, refinement=refused).name == 'BAD'
 
 
-def tilted():
-    up = np.array([[0, 0, 1], [0.2, 0, 1], [-0.2, 0, 1], [0, 0.2, 1], [0, -0.2, 1]])
-    return simulated(directions=up)
-
-
-@pytest.mark.parametrize('fitted', [fit_partial, mounting_only])
-def test_what_a_robot_cannot_determine_is_stated_once(fitted):
-    kinds = [each.kind for each in rate(fitted(tilted(), MPS2)).findings]
-    assert 'open' in kinds
-    assert not {'omitted', 'new_orientations', 'far_from_poses'} & {*kinds}
-
-
 NEAR = FACES[[0]] + 0.1 * random_directions(12, np.random.default_rng(3))
 
 
@@ -177,16 +165,6 @@ def test_calibrations_that_differ_or_are_too_uncertain_to_differ_are_not_good(
         ac.fit(simulated({**COMMON, 'offset': [each, -0.02, 0.04]}, seed=seed, **options))
         for seed, each in ((1, 0.03), (2, offset))])
     assert (comparison.agree, rate_comparison(comparison).name) == (agree, expected)
-
-
-def test_a_verification_never_advises_to_replace_what_it_verified(tmp_path):
-    other, stored = written(tmp_path / 'other.csv', HIDDEN), tmp_path / 'c.yaml'
-    ac.fit(simulated(poses=24, units='g')).save(stored)
-    target = tmp_path / 'result.json'
-    main(['verify', str(other), '-c', str(stored), '--json', str(target)])
-    step = json.loads(target.read_text(encoding='utf-8'))['next']
-    assert (step['kind'], step['command'].split()) == (
-        'fit', ['accel-calib', 'fit', str(other), '-o', str(tmp_path / 'c_new.yaml')])
 
 
 def written(path, effects, poses=40):

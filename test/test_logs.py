@@ -11,7 +11,6 @@ The golden cases `logs_…` read small ones of all dialects, what is refused, an
 """
 
 from pathlib import Path
-import sys
 import tracemalloc
 import zipfile
 
@@ -132,14 +131,6 @@ def test_every_format_is_tested_and_fleet_finds_what_is_read(tmp_path: Path) -> 
     for name in (*names, 'notes.md', 'log.tlog'):
         (tmp_path / name).touch()
     assert sorted(each.inside for each in recordings([str(tmp_path)])) == sorted(names)
-
-
-@pytest.mark.parametrize('suffix', ['.h5', '.feather'])
-def test_a_missing_library_is_named(suffix: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = next(path for path in SAME if path.suffix == suffix)
-    monkeypatch.setitem(sys.modules, LIBRARIES[suffix], None)
-    with pytest.raises(InputError, match=f'needs it .*pip install {LIBRARIES[suffix]}'):
-        read_log(path)
 
 
 @pytest.mark.parametrize('path', [*NOT_READ, *sorted((LOG_CORPUS / 'damaged').iterdir())],
