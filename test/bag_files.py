@@ -10,17 +10,14 @@ import struct
 from typing import Any
 import zlib
 
-from accel_calib.errors import InputError
-from accel_calib.logs import IMU_DOUBLES, LogOptions, read_recording
-from accel_calib.messages import correct_bag
+from accel_calib.logs import IMU_DOUBLES
 from accel_calib.table import Recording
 import lz4.frame
 import numpy as np
-import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer as Writer2
 from rosbags.typesys import get_typestore, Stores
-from shared import known, MPS2
+from shared import MPS2
 
 try:
     from compression import zstd
@@ -164,18 +161,6 @@ MAKES: dict[str, Write] = {
     'mcap storage': rosbag2(StoragePlugin.MCAP, CompressionMode.STORAGE),
     'ros1': ros1(), 'ros1 bz2': ros1(Writer1.CompressionFormat.BZ2),
     'ros1 lz4': ros1(Writer1.CompressionFormat.LZ4)}
-
-
-def check_refused(path: Path, words: str, topic: str = '') -> None:
-    """Check that reading and correcting a bag end in one line, and that nothing is written."""
-    before = {*path.parent.iterdir()}
-    for work in (lambda: read_recording(path, topic),
-                 lambda: correct_bag(path, known(), path.with_name('out'),
-                                     LogOptions(topic=topic))):
-        with pytest.raises(InputError, match=words) as refusal:
-            work()
-        assert '\n' not in str(refusal.value)
-    assert {*path.parent.iterdir()} == before
 
 
 def execute(file: Path, statement: str, *values: Any) -> None:

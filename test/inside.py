@@ -41,7 +41,6 @@ from accel_calib.effects.thermal import Lag, low_passed, rate_of
 from accel_calib.estimate import believable, kinds, originals, unseen_mistakes
 from accel_calib.estimate.closed_form import agreeing
 from accel_calib.estimate.equations import equations, measured
-from accel_calib.estimate.outliers import _look_alikes as look_alikes
 from accel_calib.findings import mounting_figures
 from accel_calib.fleet.overview import (
     digest, digest_of, estimated, not_agreeing, odd_sensors, OfModel, overview, priors_of,

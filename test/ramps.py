@@ -8,9 +8,9 @@ from pathlib import Path
 
 from accel_calib.geometry import unit
 from accel_calib.table import Floats, numbered, Recording
+from data.logs import make
 import numpy as np
 from scipy.signal import lfilter
-from test_log_formats import make
 
 G = make.G
 UP = unit(np.array([[0.02, -0.05, 0.998]]))[0]

@@ -4,13 +4,12 @@
 """
 From the log of an autopilot to its parameters, with any rotation of the board and old calibration.
 
-The firmware stands here as its own formula (`Firmware.corrected`): the readings of a sensor become
-those of a log, the log becomes a calibration and its export, and the exported parameters correct
-the readings of the sensor.
+The readings of a sensor become those of a log by the equations of the firmware, the log becomes a
+calibration and its export, and the exported parameters correct the readings of the sensor.
 
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 import re
@@ -22,13 +21,13 @@ from accel_calib.logs import write_table
 from accel_calib.stillness import capture
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Autopilot, Recording
+from data.logs import make
 from inside import (
     export, ExportOptions, main, model_with, read_log, simulate_recording, spread_directions)
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from test_exports import ardupilot, by_autopilot, qgroundcontrol
-from test_log_formats import make
+from test_exports import ardupilot, ardupilot_force, by_autopilot, px4_force, qgroundcontrol
 
 mavlink = pytest.importorskip('pymavlink.dialects.v20.common')
 pytest.importorskip('pyulog')
@@ -67,10 +66,9 @@ def raw() -> Recording:
                               temperatures=(18.0, 42.0))
 
 
-def logged(raw: Recording, rotation: Any, thermal: Callable[[Any], Any] = lambda warm: 0.0
-           ) -> Recording:
-    """Return what the firmware logs of these readings [g]: corrected, and then turned."""
-    corrected = (raw.reading * G - thermal(raw['temperature']) - OLD[0]) * OLD[1]
+def logged(raw: Recording, rotation: Any, corrected: Any = None) -> Recording:
+    """Return what the firmware logs of these readings [g]: corrected [m/s²], and then turned."""
+    corrected = (raw.reading * G - OLD[0]) * OLD[1] if corrected is None else corrected
     return raw.with_columns(reading=corrected @ rotation.T / G, rate=raw['rate'] @ rotation.T)
 
 
@@ -160,29 +158,11 @@ def test_an_external_accelerometer_of_px4_has_a_rotation_of_its_own(raw, tmp_pat
     (100, ('AHRS_CUSTOM_ROLL', 'AHRS_CUSTOM_PIT', 'AHRS_CUSTOM_YAW')),
     (101, ('CUST_ROT1_ROLL', 'CUST_ROT1_PITCH', 'CUST_ROT1_YAW')),
     (102, ('CUST_ROT2_ROLL', 'CUST_ROT2_PITCH', 'CUST_ROT2_YAW'))])
-def test_a_custom_rotation_is_undone_or_said_to_be_unknown(number, names, raw, tmp_path):
+def test_a_custom_rotation_is_undone(number, names, raw, tmp_path):
     angles = (12.0, -70.0, 33.0)
     rotation = Rotation.from_euler('xyz', angles, degrees=True).as_matrix()
     stated = {**old_ardupilot(number), **dict(zip(names, angles))}
-    path = ardupilot_log(tmp_path / 'log.bin', logged(raw, rotation), stated)
-    undone(path, raw)
-    del stated[names[2]]
-    path = ardupilot_log(tmp_path / 'log.bin', logged(raw, rotation), stated)
-    log = read_log(path)
-    np.testing.assert_allclose(log.table.reading, logged(raw, rotation).reading * G, atol=5e-5)
-    said = [note for note in log.notes if f'AHRS_ORIENTATION is {number}' in note]
-    assert len(said) == 1
-    assert names[2] in said[0]
-
-
-def test_a_parameter_of_px4_that_is_no_number_is_left_out(tmp_path: Path) -> None:
-    pytest.importorskip('pyulog')
-    samples = make.recording(1)
-    path = px4_log(tmp_path / 'log.ulg', samples, {'SENS_DAMAGED': 1})
-    sound, data = read_log(path).table, path.read_bytes()
-    path.write_bytes(data.replace(b'int32_t SENS_DAMAGED\1\0\0\0', b'char[4] SENS_DAMAGEDabcd'))
-    assert path.read_bytes() != data
-    assert read_log(path).table == sound
+    undone(ardupilot_log(tmp_path / 'log.bin', logged(raw, rotation), stated), raw)
 
 
 @pytest.mark.parametrize(('parameters', 'why'), [
@@ -204,50 +184,18 @@ def test_what_is_not_known_stays_with_the_readings_up_to_the_export(parameters, 
     assert why in ' '.join(said.split())
 
 
-def test_the_filtered_acceleration_of_px4_is_left_as_it_is(raw, tmp_path):
-    time = make.stamps_us(raw)
-    fields = {'timestamp': ('uint64_t', time), 'timestamp_sample': ('uint64_t', time),
-              **{f'xyz[{k}]': ('float', (raw.reading[:, k] * G).tolist()) for k in range(3)}}
-    path = tmp_path / 'log.ulg'
-    path.write_bytes(make.ulog_bytes([('vehicle_acceleration', 0, fields)], old_px4(4)))
-    log = read_log(path)
-    assert log.table.autopilot.corrected
-    assert any('bias that PX4' in note for note in log.notes)
-
-
-def test_an_older_px4_with_other_numbers_of_rotations_is_not_undone(raw, tmp_path):
-    path = px4_log(tmp_path / 'log.ulg', raw, old_px4(27))
-    data, key = path.read_bytes(), b'uint32_t ver_sw_release'
-    for minor, known in ((10, False), (12, True)):
-        value = (1 << 24 | minor << 16).to_bytes(4, 'little')
-        block = bytes([len(key)]) + key + value
-        info = len(block).to_bytes(2, 'little') + b'I' + block
-        at = data.index(b'char[3] sys_name') - 4
-        path.write_bytes(data[:at] + info + data[at:])
-        assert (not read_log(path).table.autopilot.corrected) is known
-
-
-def thermal_ardupilot(warm: Any, zero: float = 28.0) -> Any:
-    """Return the polynomial of ArduPilot with the parameters `THERMAL` [m/s²]; 0 at a value."""
-    def at(value: Any) -> Any:
-        change = np.atleast_1d(np.clip(value, 20.0, 40.0) - 35.0)[:, np.newaxis]
-        return (change * [3000.0, -2000.0, 1000.0] + change ** 2 * [50.0, 0.0, -70.0]) * 1e-6
-
-    return at(warm) - at(zero)
-
-
 THERMAL = {'INS_TCAL1_ENABLE': 1.0, 'INS_TCAL1_TMIN': 20.0, 'INS_TCAL1_TMAX': 40.0,
            'INS_ACC1_CALTEMP': 28.0, **three('INS_TCAL1_ACC1_', '', [3000.0, -2000.0, 1000.0]),
-           **three('INS_TCAL1_ACC2_', '', [50.0, 0.0, -70.0])}
+           **three('INS_TCAL1_ACC2_', '', [50.0, 0.0, -70.0]),
+           **three('INS_TCAL1_ACC3_', '', np.zeros(3))}
 
 
-@pytest.mark.parametrize('zero', [28.0, -300.0])
-def test_an_old_thermal_calibration_of_ardupilot_is_undone_and_replaced(zero, raw, tmp_path):
-    old = {**old_ardupilot(1), **THERMAL}
-    if zero < 0.0:
-        del old['INS_ACC1_CALTEMP']  # the default of the firmware is -300
-    path = ardupilot_log(tmp_path / 'log.bin', logged(
-        raw, named('YAW_45'), lambda warm: thermal_ardupilot(warm, zero)), old)
+@pytest.mark.parametrize('lacks', ['', 'INS_ACC1_CALTEMP'])  # the default of the firmware: -300
+def test_an_old_thermal_calibration_of_ardupilot_is_undone_and_replaced(lacks, raw, tmp_path):
+    whole = {**old_ardupilot(1), **THERMAL, **({lacks: -300.0} if lacks else {})}
+    corrected = ardupilot_force(whole, raw.reading * G, raw['temperature'])
+    old = {name: value for name, value in whole.items() if name != lacks}
+    path = ardupilot_log(tmp_path / 'log.bin', logged(raw, named('YAW_45'), corrected), old)
     undone(path, raw)
     made = calibrated(path)
     check_exported(made, 'ardupilot', raw, tmp_path)
@@ -259,15 +207,12 @@ def test_an_old_thermal_calibration_of_px4_is_undone_and_replaced(raw, tmp_path)
     orders = np.array([[0.03, -0.01, 0.02], [3e-3, -2e-3, 1e-3], [5e-5, 0.0, -7e-5],
                        [1e-6, 2e-6, 0.0]])
 
-    def thermal(warm: Any) -> Any:
-        change = (np.clip(warm, 20.0, 40.0) - 30.0)[:, np.newaxis]
-        return sum(change ** k * part for k, part in enumerate(orders))
-
     old = {**old_px4(6), 'TC_A_ENABLE': 1, 'TC_A2_ID': DEVICE, 'TC_A2_TREF': 30.0,
            'TC_A2_TMIN': 20.0, 'TC_A2_TMAX': 40.0,
            **{f'TC_A2_X{k}_{axis}': float(part[axis]) for k, part in enumerate(orders)
               for axis in range(3)}}
-    path = px4_log(tmp_path / 'log.ulg', logged(raw, named('YAW_270'), thermal), old)
+    corrected = px4_force(old, raw.reading * G, raw['temperature'], 1, thermal=2)
+    path = px4_log(tmp_path / 'log.ulg', logged(raw, named('YAW_270'), corrected), old)
     undone(path, raw, atol=2e-3)
     found = qgroundcontrol(export(calibrated(path), 'px4').text_or_bytes)
     assert found['TC_A2_ID'] == DEVICE

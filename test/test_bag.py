@@ -4,7 +4,8 @@
 """
 Bags of every kind, read and corrected without ROS, and by `rosbags` for comparison.
 
-The golden case `logs_bags` reads topics of any type: temperature, supply voltage and others.
+The golden case `logs_bags` reads topics of any type (temperature, supply voltage and others), and
+bags of several sensors, with damaged messages, without metadata, and of a killed recorder.
 
 """
 
@@ -12,6 +13,8 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 import re
+import shutil
+import sqlite3
 
 from accel_calib.calibration import fit_poses, level
 from accel_calib.errors import InputError, StoredCalibrationError
@@ -21,8 +24,9 @@ from accel_calib.stillness import capture
 from accel_calib.stored import write_calibration
 from accel_calib.table import Recording
 from bag_files import (
-    check_refused, header, IMU, imu, MAKES, McapFile, RATE_NS, rosbag2, START, STORE, STRING,
+    COUNT as FEW, header, IMU, imu, MAKES, McapFile, RATE_NS, ros1, rosbag2, START, STORE, STRING,
     TEMPERATURE, write_bag)
+from faults.fuzz import ended, read_bag
 from inside import (
     BLOCK_OF_A_BAG, read_log, rotation_from_rpy, ROWS_OF_A_BAG, simulate_recording,
     spread_directions)
@@ -31,7 +35,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin
 from scipy.spatial.transform import Rotation
-from shared import known, LOG_CORPUS, MPS2, run, sensor, table, with_effects
+from shared import known, LOG_CORPUS, MPS2, run, run_on_small_disk, sensor, table, with_effects
 import yaml
 
 ON_A = LogOptions(topic='/imu/a')
@@ -45,36 +49,11 @@ def recording():
 
 
 @pytest.fixture(scope='module')
-def ros1(recording, tmp_path_factory):
+def bag_of_ros_1(recording, tmp_path_factory):
     """Return a ROS 1 bag of the recording, its poses, and their calibration."""
     path = write_bag(tmp_path_factory.mktemp('ros1') / 'recording.bag', 'bag', recording)
     poses = capture(read_recording(path), MPS2).poses
     return path, poses, fit_poses(poses, MPS2, sensor='imu_link')
-
-
-@pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'bag'])
-def test_every_kind_of_bag_and_the_file_in_it_have_the_same_samples(kind, recording, tmp_path):
-    path = write_bag(tmp_path / ('in.bag' if kind == 'bag' else 'in'), kind, recording)
-    inside = [each for each in path.glob('*') if each.suffix in ('.mcap', '.db3')]
-    assert len(inside) == (kind != 'bag')
-    for each in (path, *inside):
-        found = read_recording(each)
-        assert (found.units, found.sensor) == ('m/s2', 'imu_link')
-        np.testing.assert_array_equal(found.reading, MPS2.from_g(recording.reading))
-        np.testing.assert_array_equal(found['rate'], recording['rate'])
-        np.testing.assert_allclose(found['time'], recording['time'] + 100.0, atol=1e-6)
-        np.testing.assert_allclose(found['temperature'], recording['temperature'], atol=0.2)
-
-
-@pytest.mark.parametrize('file', ['x.bag', 'x.mcap', 'x.db3'])
-def test_what_is_not_a_bag_is_refused_in_one_line(file, tmp_path):
-    with pytest.raises(InputError, match='is a folder without a bag'):
-        read_recording(tmp_path)
-    with pytest.raises(FileNotFoundError):
-        read_recording(tmp_path / file)
-    (tmp_path / file).write_bytes(b'not a bag at all')
-    with pytest.raises(InputError, match='is damaged'):
-        read_recording(tmp_path / file)
 
 
 def check_copy(path, copy, topic, calibration):
@@ -108,17 +87,23 @@ def check_copy(path, copy, topic, calibration):
                                           new.linear_acceleration_covariance)
 
 
-def test_a_corrected_bag_of_ros_1_differs_only_in_the_acceleration(ros1, tmp_path):
-    path, poses, calibration = ros1
-    assert correct_bag(path, calibration, tmp_path / 'out.bag') == len(read_recording(path))
+def test_a_bag_of_ros_1_is_read_and_its_copy_differs_only_in_the_acceleration(
+        bag_of_ros_1, recording, tmp_path):
+    path, poses, calibration = bag_of_ros_1
+    found = read_recording(path)
+    assert (found.units, found.sensor) == ('m/s2', 'imu_link')
+    np.testing.assert_array_equal(found.reading, MPS2.from_g(recording.reading))
+    np.testing.assert_array_equal(found['rate'], recording['rate'])
+    np.testing.assert_allclose(found['temperature'], recording['temperature'], atol=0.2)
+    assert correct_bag(path, calibration, tmp_path / 'out.bag') == len(recording)
     check_copy(path, tmp_path / 'out.bag', '/imu/data_raw', calibration)
     still = capture(read_recording(tmp_path / 'out.bag'), MPS2).poses
     assert len(still) == len(poses)
     assert np.linalg.norm(still.reading, axis=1) == pytest.approx(9.80665, abs=0.01)
 
 
-def test_a_calibration_of_another_sensor_writes_no_bag(ros1, tmp_path):
-    path, _, calibration = ros1
+def test_a_calibration_of_another_sensor_writes_no_bag(bag_of_ros_1, tmp_path):
+    path, _, calibration = bag_of_ros_1
     with pytest.raises(StoredCalibrationError, match='imu_rear'):
         correct_bag(path, replace(calibration, sensor='imu_rear'), tmp_path / 'out.bag')
     with pytest.raises(InputError, match=r'recording\.bag exists'):
@@ -126,8 +111,8 @@ def test_a_calibration_of_another_sensor_writes_no_bag(ros1, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_bag_in_ned_is_forward_right_down_and_one_of_gravity_is_refused(ros1, tmp_path):
-    path, poses, fitted = ros1
+def test_a_bag_in_ned_is_forward_right_down_and_one_of_gravity_is_refused(bag_of_ros_1, tmp_path):
+    path, poses, fitted = bag_of_ros_1
     by_frame = {frame: level(fitted, poses.reading[0], frame) for frame in ('ros', 'ned', 'win8')}
     out = {frame: tmp_path / f'{frame}.bag' for frame in by_frame}
     for frame in ('ros', 'ned'):
@@ -145,19 +130,20 @@ TOPICS = [('/imu/a', IMU), ('/imu/b', IMU), ('/temperature', TEMPERATURE), ('/wo
 IN_ORDER = ['mcap without chunks', 'mcap without summary', 'split']
 """Kinds that `rosbags` refuses if their messages are out of order."""
 
-KINDS = [*(name for name in MAKES if 'ros1' not in name), 'split']
+BIG_ENDIAN = 'mcap big-endian'
+KINDS = [*(name for name in MAKES if 'ros1' not in name), 'split', BIG_ENDIAN]
 COUNT = 200
 
 
 @cache
-def messages(seed, *, shuffled=False, frame_ids=('imu',), little_endian=True):
+def messages(seed, *, shuffled=False, little_endian=True):
     """Return (topic, time of receipt, bytes); some messages can be slightly out of order."""
     rng, made = np.random.default_rng(seed), []
     for k in range(COUNT):
         stamp = START + RATE_NS * k
         for topic in (0, 1):
             numbers = rng.normal(size=37)
-            about = header(STORE, stamp, frame_ids[k % len(frame_ids)])
+            about = header(STORE, stamp, 'imu')
             made.append((topic, stamp + topic, imu(
                 STORE, about, 9.0 + numbers[25:28], numbers[13:16], numbers[:4],
                 (numbers[4:13], numbers[16:25], np.zeros(9)))))
@@ -173,10 +159,11 @@ def messages(seed, *, shuffled=False, frame_ids=('imu',), little_endian=True):
         each, TOPICS[topic][1], little_endian=little_endian))) for topic, time, each in made)
 
 
-def write(folder, kind, made):
+def write(folder, kind, seed):
     """Write a bag; a split one has two files, the second without words."""
+    made = messages(seed, shuffled=kind not in IN_ORDER, little_endian=kind != BIG_ENDIAN)
     if kind != 'split':
-        return MAKES[kind](folder, TOPICS, made)
+        return MAKES[kind.removesuffix(' big-endian')](folder, TOPICS, made)
     path = rosbag2(StoragePlugin.MCAP)(folder, TOPICS, made[:len(made) // 2])
     McapFile(TOPICS[:3], 'zstd').write(path / 'second.mcap', [
         each for each in made[len(made) // 2:] if each[0] < 3])
@@ -203,40 +190,15 @@ def deserialized(path, topic='/imu/a'):
 @pytest.mark.parametrize(('make', 'topic'), [
     *((make, '/imu/a') for make in KINDS), ('mcap lz4', '/imu/b'), ('sqlite3', '/imu/b')])
 def test_samples_are_those_that_rosbags_deserializes(make, topic, tmp_path):
-    path = write(tmp_path, make, messages(1, shuffled=make not in IN_ORDER))
-    found = read_recording(path, topic)
-    expected = deserialized(path, topic)
+    path = write(tmp_path, make, 1)
+    found, expected = read_recording(path, topic), deserialized(path, topic)
     assert len(expected) == COUNT
-    np.testing.assert_array_equal(found['time'], expected[:, 0])
-    np.testing.assert_array_equal(found['rate'], expected[:, 1:4])
-    np.testing.assert_array_equal(found.reading, expected[:, 4:])
+    assert (found.units, found.sensor) == ('m/s2', 'imu')
+    np.testing.assert_array_equal(
+        np.column_stack([found['time'], found['rate'], found.reading]), expected)
     assert list(found.row) == list(range(1, COUNT + 1))
     warm = 20.0 + np.clip((expected[:, 0] - 1.7e9), 0.03, 1.99)
     np.testing.assert_allclose(found['temperature'], warm, atol=1e-6)
-
-
-@pytest.mark.parametrize('names', [('imu', 'imb'), ('imu', 'a_much_longer_name'), ('', 'imu')])
-@pytest.mark.parametrize('make', ['mcap', 'sqlite3'])
-def test_messages_of_another_sensor_are_refused_until_one_is_chosen(make, names, tmp_path):
-    path = write(tmp_path, make, messages(20, frame_ids=names * 50 + names[1:] * 100))
-    check_refused(path, f"/imu/a: message 2 is from the sensor '{names[1]}', "
-                  f"expected '{names[0]}' as before", '/imu/a')
-    found = read_recording(path, '/imu/a', names[1])
-    assert (len(found), found.sensor) == (150, names[1])
-    whole = deserialized(path)
-    np.testing.assert_array_equal(found.reading, whole[found.row - 1, 4:])
-
-
-@pytest.mark.parametrize('make', ['mcap', 'sqlite3'])
-def test_big_endian_messages_are_read_and_corrected(make, tmp_path):
-    path = write(tmp_path, make, messages(2, little_endian=False))
-    found = read_recording(path, '/imu/a')
-    expected = deserialized(path)
-    np.testing.assert_array_equal(np.column_stack([found['time'], found['rate'], found.reading]),
-                                  expected)
-    correct_bag(path, known(), tmp_path / 'out', ON_A)
-    np.testing.assert_allclose(deserialized(tmp_path / 'out')[:, 4:],
-                               known().correct(expected[:, 4:]), atol=1e-12)
 
 
 @pytest.mark.parametrize(('make', 'turned'), [
@@ -246,7 +208,7 @@ def test_a_corrected_bag_keeps_all_other_content(make, turned, tmp_path):
     if turned:
         model = replace(calibration.model, rotation=rotation_from_rpy(0.2, -0.4, 1.0))
         calibration = replace(calibration, model=model)
-    path = write(tmp_path, make, messages(4, shuffled=make not in IN_ORDER))
+    path = write(tmp_path, make, 4)
     calls = []
     count = correct_bag(path, calibration, tmp_path / 'out', ON_A,
                         lambda done, of: calls.append((done, of)))
@@ -284,25 +246,15 @@ def test_a_file_becomes_a_file_or_a_folder_with_the_metadata_of_its_messages(plu
                                   deserialized(tmp_path / f'out{file.suffix}'))
 
 
-@pytest.mark.parametrize('make', ['mcap', 'sqlite3'])
-@pytest.mark.parametrize('spoil', [
-    lambda raw: b'', lambda raw: raw[:100], lambda raw: raw[:-8], lambda raw: raw + bytes(8),
-    lambda raw: raw[:12] + b'\xff' * 4 + raw[16:], lambda raw: b'\x00\x03' + raw[2:]],
-    ids=['empty', 'short', 'a double less', 'a double more', 'long frame_id', 'parameter list'])
-def test_a_damaged_message_is_reported_in_one_line(make, spoil, tmp_path):
-    made = list(messages(9))
-    which = [k for k, (channel, _, _) in enumerate(made) if channel == 0][-1]
-    broken = spoil(made[which][2])
-    made[which] = (0, made[which][1], broken)
-    path = write(tmp_path, make, made)
-    check_refused(path, f'/imu/a: message {COUNT} of {len(broken)} bytes is damaged', '/imu/a')
-    assert len(read_recording(path, '/imu/b')) == COUNT
+NOT_READ = sorted(path for path in (LOG_CORPUS / 'bags').iterdir() if re.match(
+    'message|acceleration|two_sensors|no_message', path.name))
 
 
-@pytest.mark.parametrize('make', ['mcap', 'sqlite3'])
-def test_a_topic_without_messages_is_reported_in_one_line(make, tmp_path):
-    path = write(tmp_path, make, [each for each in messages(11) if each[0]])
-    check_refused(path, 'has no message on /imu/a', '/imu/a')
+@pytest.mark.parametrize('path', NOT_READ, ids=lambda path: path.stem)
+def test_a_bag_that_is_not_read_is_not_corrected(path, tmp_path):
+    with pytest.raises(InputError):
+        correct_bag(path, known(), tmp_path / 'out')
+    assert not any(tmp_path.iterdir())
 
 
 def test_poses_do_not_depend_on_the_size_of_blocks(recording, tmp_path, monkeypatch):
@@ -340,6 +292,8 @@ def test_a_bag_is_corrected_with_a_named_temperature(tmp_path: Path) -> None:
     with pytest.raises(InputError, match='name the topic with'):
         correct_bag(BAG, thermal, out)
     notes: list[str] = []
+    assert correct_bag(BAG, known('g'), tmp_path / 'plain', note=notes.append) == SAMPLES
+    assert notes == []  # this one needs no temperature
     assert correct_bag(BAG, thermal, out, WARM, note=notes.append) == SAMPLES
     assert len(notes) == 1  # the temperatures have no stamp
     raw, found = read_log(BAG, WARM).table, read_recording(out)
@@ -354,7 +308,65 @@ def test_a_bag_is_corrected_with_a_named_temperature(tmp_path: Path) -> None:
     assert run(*given, '--context', 'temperature:=/imu/temp') == 0
 
 
-def test_a_calibration_without_temperature_needs_no_topic(tmp_path: Path) -> None:
-    notes: list[str] = []
-    assert correct_bag(BAG, known('g'), tmp_path / 'out', note=notes.append) == SAMPLES
-    assert notes == []
+# Bags of killed recorders, and full disks
+
+
+def test_the_messages_in_the_journal_of_a_killed_recorder_are_read(tmp_path: Path) -> None:
+    made = MAKES['sqlite3'](tmp_path)
+    database = sqlite3.connect(made / 'bag.db3', isolation_level=None)
+    for statement in ('PRAGMA journal_mode = WAL', 'PRAGMA wal_autocheckpoint = 0',
+                      'INSERT INTO messages SELECT id + 1000, topic_id, timestamp + 1000000000, '
+                      'data FROM messages WHERE topic_id = 1'):
+        database.execute(statement)
+    path = Path(shutil.copytree(made, tmp_path / 'killed'))
+    database.close()
+    (path / 'bag.db3-shm').unlink()
+    before = {each: (each.read_bytes(), each.stat().st_mtime_ns) for each in path.iterdir()}
+    for each in (path, path / 'bag.db3'):
+        log = read_log(each)
+        assert len(log.table) == 2 * FEW
+        assert 'its last messages are read from bag.db3-wal' in log.notes[0]
+    assert correct_bag(path, known(), tmp_path / 'out') == 2 * FEW
+    assert before == {
+        each: (each.read_bytes(), each.stat().st_mtime_ns) for each in path.iterdir()}
+
+
+@pytest.mark.parametrize('name', ['run #1', 'what?', '100%20'])
+def test_letters_of_a_uri_in_a_name_are_read(name: str, tmp_path: Path) -> None:
+    path = MAKES['sqlite3'](tmp_path).rename(tmp_path / name)
+    for each in (path, path / 'bag.db3'):
+        assert len(read_recording(each)) == FEW
+
+
+@pytest.mark.parametrize('suffix', ['-wal', '-journal'])
+def test_a_damaged_journal_ends_in_one_line_or_in_a_result(suffix: str, tmp_path: Path) -> None:
+    (tmp_path / 'in').mkdir()
+    path = MAKES['sqlite3'](tmp_path / 'in')
+    for content in (b'x', bytes(4096), b'SQLite format 3' * 500):
+        (path / f'bag.db3{suffix}').write_bytes(content)
+        assert ended(read_bag, path, np.random.default_rng(1)) in ('read', 'refused')
+
+
+def test_an_anchor_of_several_values_in_the_metadata_causes_no_warning(
+        tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    path = MAKES['mcap folder'](tmp_path)
+    text = (path / 'metadata.yaml').read_text()
+    assert text.count('message_count: ') > 1
+    (path / 'metadata.yaml').write_text(text.replace('message_count: ', 'message_count: &a '))
+    assert len(read_recording(path)) == FEW
+    assert not [str(each.message) for each in recwarn]
+
+
+@pytest.mark.parametrize(('name', 'size_kb'), [
+    ('out', 8), ('out', 24), ('out.db3', 24), ('out.mcap', 8), ('out.bag', 24)])
+def test_a_copy_on_a_full_disk_is_one_line_and_nothing_stored(
+        name: str, size_kb: int, tmp_path: Path) -> None:
+    write_calibration(tmp_path / 'c.yaml', known())
+    path = (ros1() if name.endswith('.bag') else rosbag2(StoragePlugin.SQLITE3))(tmp_path)
+    disk = tmp_path / 'disk'
+    done, copy = run_on_small_disk(
+        disk, size_kb, 'apply', path, '-c', tmp_path / 'c.yaml', '-o', disk / name)
+    assert (done.returncode, done.stderr.count('\n')) == (2, 1), done.stderr
+    assert f'{disk}/' in done.stderr
+    assert 'No space left' in done.stderr
+    assert list(copy.iterdir()) == []

@@ -8,8 +8,9 @@ Binary files are read in a child process; however it ends, the result is one lin
 
 """
 
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
+import itertools
 import os
 from pathlib import Path
 import shutil
@@ -77,7 +78,7 @@ def test_data_that_compress_well_are_read(tmp_path: Path) -> None:
     assert correct_bag(path, known(), tmp_path / 'out') == COUNT
 
 
-def test_correcting_leaves_a_database_as_it_is_and_refuses_a_copy_that_lacks_messages(
+def test_a_copy_that_lacks_messages_is_refused(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write, count = rosbag2.Writer.write, iter(range(10 ** 6))
 
@@ -86,17 +87,10 @@ def test_correcting_leaves_a_database_as_it_is_and_refuses_a_copy_that_lacks_mes
             write(self, *message)
 
     path = folder_of(StoragePlugin.SQLITE3)(tmp_path)
-
-    def state() -> dict[Path, Any]:
-        return {each: (each.read_bytes(), each.stat().st_mtime_ns) for each in path.iterdir()}
-
-    before = state()
-    assert correct_bag(path, known(), tmp_path / 'whole') == COUNT
-    assert state() == before
     monkeypatch.setattr(rosbag2.Writer, 'write', losing)
     with pytest.raises(InputError, match='the copy holds 83 of 84 messages'):
         correct_bag(path, known(), tmp_path / 'out')
-    assert sorted(each.name for each in tmp_path.iterdir()) == ['bag', 'whole']
+    assert [*tmp_path.iterdir()] == [path]
 
 
 # ----------------------------------------------------------------------------- regular files
@@ -144,44 +138,45 @@ def test_a_pipe_in_the_folder_of_a_bag_is_refused(name: str, tmp_path: Path) -> 
 # The child process that reads binary files
 
 
+def raise_error(path: Path) -> None:
+    raise KeyError('a\nb')
+
+
+def loop(path: Path) -> None:
+    while True:
+        pass
+
+
+MISBEHAVIOUR: dict[str, tuple[Callable[[Path], Any], str]] = {
+    'signal': (lambda path: os.kill(os.getpid(), signal.SIGSEGV), 'SIGSEGV'),
+    'exit': (lambda path: os._exit(3), 'status 3'),
+    'system exit': (lambda path: sys.exit('enough'), 'status 1'),
+    'error': (raise_error, "KeyError 'a"), 'loop': (loop, '4 s'),
+    'memory': (lambda path: bytearray(1 << 33), 'more memory'),
+    'file': (lambda path: os.truncate(path, 1 << 29), 'File too large'),
+    'object': (lambda path: [np.array([{}])], 'array of object'),
+    'many': (lambda path: itertools.repeat(np.zeros(1 << 20)), 'more than 2[0-9]+ bytes')}
+"""What no reader should do, perhaps what it yields then, and words of the error."""
+
+
 def misbehaving(path: Path, how: str) -> Generator[Any]:
     """Yield an array, and then do what no reader should."""
     yield np.arange(6.0).reshape(2, 3)
     sys.stdout.write('words of a library')
     sys.stdout.flush()
-    if how == 'signal':
-        os.kill(os.getpid(), signal.SIGSEGV)
-    elif how == 'exit':
-        os._exit(3)
-    elif how == 'system exit':
-        sys.exit('enough')
-    elif how == 'error':
-        raise KeyError('a\nb')
-    elif how == 'memory':
-        bytearray(1 << 33)
-    elif how == 'file':
-        os.truncate(path, 1 << 29)
-    elif how == 'object':
-        yield np.array([{}])
-    while how == 'loop':
-        pass
-    while how == 'many':
-        yield np.zeros(1 << 20)
+    yield from MISBEHAVIOUR[how][0](path)
 
 
-@pytest.mark.parametrize(('how', 'words'), [
-    ('signal', 'SIGSEGV'), ('exit', 'status 3'), ('system exit', 'status 1'),
-    ('error', "KeyError 'a"), ('memory', 'more memory'), ('file', 'File too large'),
-    ('loop', '4 s'), ('object', 'array of object'), ('many', 'more than 2[0-9]+ bytes')])
+@pytest.mark.parametrize('how', MISBEHAVIOUR)
 def test_whatever_ends_a_child_is_one_line_that_names_the_file(
-        how: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+        how: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
         capfd: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(*PATIENCE_WITH_A_CHILD, 3)
     path = tmp_path / 'log.mcap'
     path.write_bytes(b'12')
     with parts_of(BAG.file(path), misbehaving, how, in_child=True) as parts:
         assert next(parts).shape == (2, 3)
-        with pytest.raises(InputError, match=words) as found:
+        with pytest.raises(InputError, match=MISBEHAVIOUR[how][1]) as found:
             list(map(np.sum, parts))
     assert str(path) in str(found.value)
     assert '\n' not in str(found.value)

@@ -1,21 +1,27 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The command line: results, JSON, and one line for invalid input."""
+"""The command line: results, JSON, one line for invalid input, and one command from any log."""
 
-import dataclasses
+from dataclasses import fields, replace
 import json
 from pathlib import Path
 import re
 import shutil
 import sys
 
+import accel_calib as ac
+from accel_calib.errors import RefusedFitError
 from accel_calib.stillness import CaptureSettings
+from accel_calib.stored import read_calibration
 from inside import (
-    CALIBRATOR, COMMAND, COMMANDS, main, parser, rotation_from_rpy, spread_directions)
+    are_samples, calibrated_by, CALIBRATOR, COMMAND, COMMANDS, FitPlan, is_partial, main, parser,
+    rotation_from_rpy, spread_directions)
 import numpy as np
 import pytest
-from shared import forked, LOGS, OPTIONS, python, refused, run, run_json, table
+from shared import (
+    data, forked, LOG_CORPUS, LOGS, MPS2, OPTIONS, python, random_directions, refused, run,
+    run_json, run_on_small_disk, SENSOR, table)
 
 
 @pytest.fixture(scope='module')
@@ -216,7 +222,9 @@ def test_the_report_has_a_page_and_figures(poses, tmp_path):
 @pytest.mark.parametrize(('module', 'line'), [
     ('matplotlib', 'refine poses.csv --report r.html'), ('aiohttp', 'live poses.csv'),
     ('pyulog', f'capture {LOGS}/px4/default.ulg -o p.csv'),
-    ('pymavlink', f'capture {LOGS}/ardupilot/two_imus.bin -o p.csv')])
+    ('pymavlink', f'capture {LOGS}/ardupilot/two_imus.bin -o p.csv'),
+    *((module, f'capture {next((LOG_CORPUS / "formats").glob(f"*{suffix}"))} -o p.csv')
+      for module, suffix in (('h5py', '.h5'), ('pyarrow', '.feather')))])
 def test_a_missing_library_is_named_in_one_line_with_how_to_install_it(module, line, poses, capsys,
                                                                        monkeypatch):
     monkeypatch.chdir(poses.parent)
@@ -229,7 +237,7 @@ def test_a_missing_library_is_named_in_one_line_with_how_to_install_it(module, l
 # --------------------------------------------------------------------- settings of the capture
 
 
-def shaky(path, quiet=3, shaken=9, std_g=0.012):
+def shaky(path, quiet, shaken, std_g=0.012):
     """Write a recording whose first rests are quiet, and whose other rests are shaken."""
     rng = np.random.default_rng(3)
     rest, turn, rows = 250, 80, []
@@ -246,29 +254,148 @@ def shaky(path, quiet=3, shaken=9, std_g=0.012):
 
 @pytest.mark.parametrize('line', table('capturing_commands'))
 def test_every_command_that_captures_has_all_settings_of_the_capture(line):
-    assert {each.name for each in dataclasses.fields(CaptureSettings)} <= vars(
+    assert {each.name for each in fields(CaptureSettings)} <= vars(
         parser(line.split()).parse_args(line.split())).keys()
 
 
-def test_a_wider_limit_that_finds_many_more_poses_is_stated_and_can_be_used(tmp_path, capsys):
-    log = shaky(tmp_path / 'log.csv')
-    run('calibrate', log, '-o', tmp_path / 'c.yaml')
+@pytest.mark.parametrize(('quiet', 'given', 'stated'), [
+    (3, (), r'(\d) poses only'),
+    (0, ('--still-std-max', 0.004), r'0.5 s the standard deviation is (\S+) g, the limit is')])
+def test_a_wider_limit_that_finds_many_more_poses_is_stated_and_can_be_used(
+        quiet, given, stated, tmp_path, capsys):
+    log = shaky(tmp_path / 'log.csv', quiet, 12 - quiet)
+    assert run('calibrate', log, '-o', tmp_path / 'c.yaml', *given) == 2
     words = ' '.join(''.join(capsys.readouterr()).split())
-    (few, many, limit), = re.findall(r'(\d) poses only, (\d+) with still_std_max (\S+)', words)
-    assert int(many) >= 2 * int(few)
-    run('calibrate', log, '-o', tmp_path / 'c.yaml', '--still-std-max', limit)
-    assert f'captured {many} poses' in capsys.readouterr().out
-
-
-def test_without_a_still_stretch_the_quietest_window_the_limit_and_a_wider_one_are_stated(
-        tmp_path, capsys):
-    log = shaky(tmp_path / 'log.csv', quiet=0, shaken=12)
-    status, result = run_json(capsys, 'calibrate', log, '-o', tmp_path / 'c.yaml',
-                              '--still-std-max', 0.004)
-    assert status == 2
-    deviation, = re.findall(
-        r'quietest 0.5 s the standard deviation is (\S+) g, the limit is 0.004', result['error'])
-    assert float(deviation) == pytest.approx(0.012 / np.sqrt(2.0), rel=0.1)
-    (count, limit), = re.findall(r'(\d+) with still_std_max (\S+)', result['advice'])
+    (many, limit), = re.findall(r'(\d+) with still_std_max (\d\S*\d)', words)
+    assert int(many) >= 6
+    assert float(*re.findall(stated, words)) == pytest.approx(
+        quiet or 0.012 / np.sqrt(2.0), rel=0.1)
     run('capture', log, '-o', tmp_path / 'p.csv', '--still-std-max', limit)
-    assert f'captured {count} poses from' in capsys.readouterr().out
+    assert f'captured {many} poses from' in capsys.readouterr().out
+
+
+# One command from any log to a calibration, a page and a verdict
+
+
+@pytest.fixture
+def recording(tmp_path):
+    path = tmp_path / 'log.csv'
+    assert run('simulate', '-o', path, '--recording', '--poses', 14, '--dwell', 3, *OPTIONS,
+               '--mounting', 5, -3, 0) == 0
+    return path
+
+
+def test_a_recording_becomes_a_calibration_a_page_and_a_verdict(recording, tmp_path, capsys):
+    out = tmp_path / 'c.yaml'
+    status, result = run_json(capsys, 'calibrate', recording, '-o', out, '--flat', 'first')
+    assert (status, result['rating']) == (0, 'GOOD')
+    assert result['rating_reason']
+    np.testing.assert_allclose(np.array(result['offset']) / 9.80665, SENSOR['offset'], atol=2e-3)
+    stored = read_calibration(out)
+    assert stored.is_levelled
+    np.testing.assert_allclose(stored.apply(stored.poses.reading[0]), (0, 0, 9.80665), atol=0.05)
+    np.testing.assert_allclose(stored.offset, result['offset'])
+    assert 'GOOD' in (tmp_path / 'c.html').read_text(encoding='utf-8')
+
+
+def bent(path, *, bend_mg):
+    """Write poses of a sensor whose readings are far from an ellipsoid, without their noise."""
+    up = random_directions(40, np.random.default_rng(5))
+    rough = np.sign(np.sin(9.0 * up[:, :1])) * bend_mg * 1e-3
+    np.savetxt(path, 9.80665 * up * (1.0 + rough), delimiter=',', header='ax,ay,az', comments='')
+    return path
+
+
+@pytest.mark.parametrize('command', ['calibrate', 'fit', 'refine'])
+def test_a_bad_calibration_is_not_stored_unless_asked_for(command, tmp_path, capsys):
+    path, out = bent(tmp_path / 'poses.csv', bend_mg=40.0), tmp_path / 'c.yaml'
+    for more in ((), ('--keep-bad',)):
+        status, result = run_json(capsys, command, path, '-o', out, *more)
+        assert (status, result['rating'], out.exists()) == (1, 'BAD', bool(more))
+        assert out.with_suffix('.html').exists() is (command == 'calibrate')
+    status, result = run_json(capsys, 'verify', path, '-c', out)
+    assert (status, result['rating']) == (1, 'BAD')
+
+
+def test_what_the_gate_refuses_is_never_stored(tmp_path, capsys):
+    path, out = bent(tmp_path / 'poses.csv', bend_mg=150.0), tmp_path / 'c.yaml'
+    status, result = run_json(capsys, 'calibrate', path, '-o', out, '--keep-bad')
+    assert (status, {*result}, out.exists()) == (2, {'file', 'error', 'advice'}, False)
+
+
+@pytest.mark.usefixtures('without_pages')
+@pytest.mark.parametrize(('flat', 'row'), [('last', 13), ('3', 2)])
+def test_the_flat_pose_is_the_first_the_last_or_a_row(flat, row, recording, tmp_path, capsys):
+    out = tmp_path / 'c.yaml'
+    run_json(capsys, 'calibrate', recording, '-o', out, '--flat', flat, '--no-refine')
+    stored = read_calibration(out)
+    np.testing.assert_allclose(stored.apply(stored.poses.reading[row]), (0, 0, 9.80665), atol=0.05)
+
+
+@pytest.mark.usefixtures('without_pages')
+@pytest.mark.parametrize('name', ['xsens_mti_counts', 'mpu9150_imu1'])
+def test_real_logs_become_good_calibrations_without_an_option(name, tmp_path, capsys):
+    status, result = run_json(capsys, 'calibrate', data(f'{name}.csv'), '-o', tmp_path / 'c.yaml',
+                              '--no-refine')
+    assert (status, result['rating']) == (0, 'GOOD')
+    assert result['units'] == ('native' if name.startswith('xsens') else 'm/s2')
+    assert result['rms_after_mg'] <= (0.115 if name.startswith('xsens') else 0.3)  # as imu_tk
+
+
+@pytest.mark.parametrize(('step', 'rows', 'count', 'samples'), [
+    (0.01, 20, {}, True), (20.0, 60, {}, False), (0.1, 60, {'count': np.ones(60)}, False),
+    (10.0, 6000, {}, True)])
+def test_samples_are_distinguished_from_poses(step, rows, count, samples):
+    columns = {'time': np.arange(rows) * step, 'reading': np.ones((rows, 3)), **count}
+    assert are_samples(columns) == samples
+
+
+@pytest.mark.parametrize(('per_g', 'unit'), [(1000.0, 'g'), (1024.0, 'native')])
+def test_whole_numbers_are_mg_only_where_1_g_is_about_1000(per_g, unit, tmp_path):
+    made = ac.simulate({}, recording=True, poses=10, units='g')
+    np.savetxt(tmp_path / 'log.csv', np.column_stack([made['time'], np.round(
+        per_g * made.reading)]), delimiter=',', header='time,ax,ay,az', comments='')
+    assert ac.capture(tmp_path / 'log.csv').units == unit
+
+
+@pytest.mark.parametrize(('size_kb', 'status', 'left'), [(64, 0, ['c.yaml']), (4, 2, [])])
+@pytest.mark.parametrize('command', ['calibrate', 'fit'])
+def test_a_page_or_calibration_that_does_not_fit_on_the_disk_is_one_line(
+        command, size_kb, status, left, recording, tmp_path):
+    disk = tmp_path / 'disk'
+    more = {'calibrate': ['--no-refine'], 'fit': ['--report', disk / 'c.html']}[command]
+    done, copy = run_on_small_disk(disk, size_kb, command, recording, '-o', disk / 'c.yaml', *more)
+    assert (done.returncode, done.stderr.count('\n')) == (status, 1 if status else 0)
+    assert 'No space left' in (done.stderr if status else done.stdout)
+    assert [each.name for each in copy.iterdir()] == left
+    assert all(read_calibration(copy / name).name for name in left)
+
+
+# The plan of a fit beside a calibration that is in use
+
+PLAN = FitPlan(model='10', refined=False)
+
+
+def test_frame_and_mounting_of_the_calibration_in_use_are_kept() -> None:
+    first, second = (ac.simulate(SENSOR, poses=16, seed=seed) for seed in (1, 2))
+    assert not calibrated_by(second, MPS2, PLAN).calibration.is_levelled
+    before = calibrated_by(first, MPS2, replace(PLAN, flat=3, frame='android')).calibration
+    after = calibrated_by(second, MPS2, replace(PLAN, before=before)).calibration
+    assert after.frame == before.frame
+    np.testing.assert_allclose(after.rotation, before.rotation, atol=1e-3)
+    moved = calibrated_by(second, MPS2, replace(PLAN, before=before, flat=5)).calibration
+    assert np.max(np.abs(moved.rotation - before.rotation)) > 0.1
+
+
+def test_poses_near_one_direction_are_fitted_if_planned_and_replace_no_full_fit() -> None:
+    tilts = np.array([[0, 0], [0.25, 0], [-0.2, 0.1], [0, 0.25], [0.1, -0.25], [-0.15, -0.2]])
+    cone = ac.simulate(SENSOR, directions=np.column_stack([tilts, np.ones(len(tilts))]))
+    with pytest.raises(RefusedFitError):
+        calibrated_by(cone, MPS2, PLAN)
+    partial = calibrated_by(cone, MPS2, replace(PLAN, partial=True)).calibration
+    assert is_partial(partial)
+    again = calibrated_by(cone, MPS2, replace(PLAN, partial=True, before=partial)).calibration
+    assert is_partial(again)
+    full = calibrated_by(ac.simulate(SENSOR, poses=16), MPS2, PLAN).calibration
+    with pytest.raises(RefusedFitError):
+        calibrated_by(cone, MPS2, replace(PLAN, partial=True, before=full))

@@ -85,13 +85,6 @@ def test_a_curve_is_constant_outside_of_its_range(name):
     assert np.max(np.abs(reading[2] - reading[1])) > 1e-3
 
 
-def test_a_curve_over_the_force_is_constant_beyond_1_g():
-    force = np.array([[1.0, -1.0, 0.2], [1.7, -3.0, 0.2]])
-    model = model_with({'empirical-offset-force-1-3': np.linspace(-3e-3, 4e-3, 6)})
-    added = predict(model, force, {}) - force
-    np.testing.assert_allclose(added[1], added[0], atol=1e-15)
-
-
 def test_a_gain_that_depends_on_the_direction_has_the_forms_of_its_degrees():
     rng = np.random.default_rng(3)
     up, oblique = random_directions(200, rng), random_directions(1, rng)[0]
@@ -129,26 +122,6 @@ def test_a_nonlinearity_along_an_oblique_axis_is_described(oblique, form):
     assert re.search(r'<td>curve of force[^<]+</td><td>\d', page)
 
 
-def test_a_gain_of_all_degrees_has_each_of_them_once():
-    rng = np.random.default_rng(0)
-    curve = EmpiricalCurve('force', 'direction', tuple(modes_of('direction')))
-    values = rng.normal(size=len(curve.entry.parameters)) * 2e-3
-    model = Model({'offset': np.array([0.01, 0.02, 0.0]), curve: values})
-    poses = simulate_poses(model, random_directions(200, rng), rng, noise_g=3e-4, context={})
-    assert best_curve(base_of(poses), poses, ()).name == curve
-
-
-def test_the_values_of_a_curve_are_the_cosines_of_its_definition():
-    name = 'empirical-offset.x-temperature-2-3'
-    temperature = np.linspace(15.0, 35.0, 9)
-    added = predict(model_with({name: CURVES[name]}), np.zeros((9, 3)),
-                    {'temperature': temperature})
-    share = (temperature - 15.0) / 20.0
-    np.testing.assert_allclose(added[:, 0], 4e-3 * np.cos(2.0 * np.pi * share)
-                               - 2e-3 * np.cos(3.0 * np.pi * share), atol=1e-15)
-    np.testing.assert_array_equal(added[:, 1:], 0.0)
-
-
 def test_a_curve_is_recovered_within_its_uncertainty():
     def form(temperature):
         share = (temperature - low) / (high - low)
@@ -173,20 +146,6 @@ def test_a_curve_is_recovered_within_its_uncertainty():
     assert np.max(deviation) < 5e-4
 
 
-@pytest.fixture(scope='module')
-def described():
-    """Return the refinement of poses with a hump."""
-    return refine(with_curve(hump)[0], G, base='10')
-
-
-def test_a_hump_over_the_temperature_is_located_and_described(described):
-    assert described.verdict == 'described'
-    (step,) = described.steps
-    assert step.effect == 'empirical'
-    assert step.p_value < 1e-6
-    assert step.held_out_after_mg < 0.5 * step.held_out_before_mg
-
-
 @pytest.mark.parametrize('scatter_g', [0.0, 2e-3])
 def test_noise_and_poses_that_repeat_badly_have_no_curve(scatter_g):
     for seed in range(2):
@@ -206,7 +165,12 @@ def test_a_curve_that_leaves_most_of_the_gap_is_not_added():
     assert (found.verdict, found.steps) == ('unexplained', ())
 
 
-def test_a_calibration_with_a_curve_is_stored_and_read_with_all_digits(described):
+def test_a_hump_over_the_temperature_is_described_and_stored_and_read_with_all_digits():
+    described = refine(with_curve(hump)[0], G, base='10')
+    (step,) = described.steps
+    assert (described.verdict, step.effect) == ('described', 'empirical')
+    assert step.p_value < 1e-6
+    assert step.held_out_after_mg < 0.5 * step.held_out_before_mg
     calibration = described.calibration
     name = next(name for name in calibration.model.values if kind_of(name) == EMPIRICAL)
     text = format_calibration(calibration)
@@ -218,7 +182,7 @@ def test_a_calibration_with_a_curve_is_stored_and_read_with_all_digits(described
     reading = np.tile([0.1, 0.2, 0.97], (4, 1))
     np.testing.assert_array_equal(found.correct(reading, at), calibration.correct(reading, at))
     comment = ' '.join(export(found, 'c').text_or_bytes.replace(' * ', ' ').split())
-    assert described.steps[-1].formula.replace('°C', 'degC') in comment
+    assert step.formula.replace('°C', 'degC') in comment
 
 
 @pytest.mark.parametrize(('form', 'curve'), [

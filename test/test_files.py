@@ -22,7 +22,7 @@ from accel_calib.effects import OwnEffect
 from accel_calib.errors import (
     AccelCalibError, DamagedCalibrationError, InputError, StoredCalibrationError)
 from accel_calib.finding import has
-from accel_calib.logs import read_poses, read_recording, write_table
+from accel_calib.logs import read_poses, write_table
 from accel_calib.stored import read_calibration, read_prior, write_calibration
 from accel_calib.table import COLUMNS, numbered, Poses
 from faults.fuzz import LONGEST_LINE
@@ -34,12 +34,6 @@ import numpy as np
 import pytest
 from shared import G, sensor, table, with_effects
 import yaml
-
-
-def write(folder, text):
-    path = folder / 'table.csv'
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return path
 
 
 def every_column(count=4):
@@ -63,13 +57,6 @@ def test_every_column_is_read_as_it_was_written(tmp_path):
     np.testing.assert_allclose(np.diff(found['time']), 0.0025, atol=5e-7)
 
 
-def test_a_recording_needs_times_and_a_missing_file_is_an_error_of_the_system(tmp_path):
-    with pytest.raises(InputError, match='no column time'):
-        read_recording(write(tmp_path, 'ax,ay,az\n1,2,3\n4,5,6\n'))
-    with pytest.raises(FileNotFoundError):
-        read_poses(tmp_path / 'none.csv')
-
-
 @pytest.fixture(params=['4', '9', '10', '12'])
 def calibration(request):
     rng, directions = np.random.default_rng(2), spread_directions(16)
@@ -91,24 +78,6 @@ def test_a_stored_calibration_is_read_with_all_digits_and_the_previous_one_is_ke
     reading = np.random.default_rng(3).normal(size=(5, 3))
     np.testing.assert_array_equal(found.correct(reading), calibration.correct(reading))
     np.testing.assert_array_equal(found.gain_sd, calibration.gain_sd)
-
-
-@pytest.mark.parametrize(('values', 'text'), [
-    ([1e-3, 2e-3, -1e-3], 'x: 0.001, y: 0.002, z: -0.001}'),
-    ([1e-3, 2e-3, -1e-3, 60.0, 0.0], 'z: -0.001, lag: 60.0}'),
-    ([1e-3, 2e-3, -1e-3, 60.0, 1.0], 'z: -0.001, lag: 60.0, of_sensor: 1.0}')])
-def test_shape_at_its_usual_value_is_not_stored(values, text, calibration):
-    model = Model({**calibration.model.values, 'offset_temperature': np.array(values)})
-    size = len(calibration.covariance) + (4 if len(values) == 5 else 3) + (values[-1] == 1.0)
-    root = np.random.default_rng(1).normal(size=(size, size)) * 1e-6
-    given = replace(calibration, model=model, covariance=root @ root.T)
-    stored = format_calibration(given)
-    assert text in ' '.join(stored.split())
-    found = parse_calibration(stored, 'calibration.yaml')
-    np.testing.assert_array_equal(found.model.vector, model.vector)
-    np.testing.assert_array_equal(found.covariance, given.covariance)
-    again = format_calibration(found)
-    assert format_calibration(parse_calibration(again, 'calibration.yaml')) == again
 
 
 def put(path, text='new\n'):
@@ -244,12 +213,6 @@ def test_the_size_of_a_file_is_bounded_before_it_is_parsed(
     os.mkfifo(tmp_path / 'pipe')
     with pytest.raises(InputError, match='is a pipe'):
         read(tmp_path / 'pipe')
-
-
-def test_another_format_of_typical_values_is_refused_in_one_line(tmp_path: Path) -> None:
-    (tmp_path / 'fleet.yaml').write_text('format: "a\\nb"\n')
-    with pytest.raises(InputError, match=r"has format 'a b', expected 1"):
-        read_prior(tmp_path / 'fleet.yaml')
 
 
 def with_poses(count: int) -> Calibration:

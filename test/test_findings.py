@@ -1,22 +1,31 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Findings, the rating, which says what to do, and the next step, the same on all surfaces."""
+"""
+What is refused, what is found, and what to do next, the same on all surfaces.
+
+Bad rows, absurd numbers and edited files never lead to a wrong calibration.
+
+"""
 
 from dataclasses import replace
 import json
+from pathlib import Path
 import shlex
 
 import accel_calib as ac
-from accel_calib.calibration import fit_partial, fit_poses, mounting_only, Rejected
+from accel_calib.calibration import fit_poses, gated, Rejected
+from accel_calib.errors import RefusedFitError
 from accel_calib.finding import Finding, KINDS, NextStep, rated, without
-from accel_calib.findings import (
-    Expected, figures_of, GOOD_MG, rate, rate_comparison, rate_verification)
+from accel_calib.findings import Expected, GOOD_MG, rate, rate_comparison, rate_verification
 from accel_calib.logs import write_table
-from inside import main, Model, model_with, spread_directions
+from accel_calib.stored import OF_FILE, read_calibration
+from inside import (
+    format_calibration, main, Model, model_with, parse_calibration, simulate_poses,
+    spread_directions)
 import numpy as np
 import pytest
-from shared import changed, error_mg, FACES, G, MPS2, random_directions
+from shared import changed, error_mg, FACES, G, MPS2, poses_of, random_directions, sensor, table
 
 TIME = 20.0 * np.arange(30)
 WARM = 27.0 + 3.5 * np.sin(TIME / 60.0)
@@ -27,15 +36,6 @@ HIDDEN = {**COMMON, 'quadratic': [0.03, -0.02, 0.02]}
 
 def simulated(effects=COMMON, **options):
     return ac.simulate(effects, **options)
-
-
-def poses_of(count=24, **options):
-    up = random_directions(count, np.random.default_rng(4))
-    return simulated(directions=up, units='g', **options)
-
-
-def moved(poses, rows, by):
-    return changed(poses, np.subtract(rows, 1), plus=by)
 
 
 def test_findings_are_ranked_by_level_and_then_by_kind():
@@ -56,18 +56,6 @@ def test_findings_and_steps_have_a_listed_kind_and_a_finding_has_the_step_of_its
         NextStep('wait', 'what')
 
 
-def test_figures_that_are_not_known_are_left_out_and_a_gain_not_fitted_has_no_deviation():
-    calibration = ac.fit(poses_of().reading, units='g')
-    keys = [figure.key for figure in figures_of(calibration)]
-    assert 'noise_floor_mg' not in keys
-    assert 'rms_after_mg' in keys
-    fixed = replace(calibration, model=Model({'offset': calibration.offset}),
-                    covariance=calibration.covariance[:3, :3])
-    found = {figure.key: figure for figure in figures_of(fixed)}
-    assert (found['gain.x'].value, found['gain.x'].sd) == (1.0, 0.0)
-    assert 'gain.xy' not in found
-
-
 @pytest.mark.parametrize('seed', range(4))
 @pytest.mark.parametrize(('poses', 'noise'), [(12, 0.001), (18, 0.01), (40, 0.02)])
 def test_the_error_of_a_good_calibration_is_below_the_stated_one(poses, noise, seed):
@@ -79,10 +67,40 @@ def test_the_error_of_a_good_calibration_is_below_the_stated_one(poses, noise, s
     assert error_mg(calibration, model_with(COMMON)) < min(1.2 * stated, GOOD_MG)
 
 
-def test_a_model_without_cross_axis_is_usable_if_the_poses_do_not_determine_it():
-    up = np.vstack([FACES, FACES[[0, 1, 2]]]) + 1e-3
-    rating = rate(ac.fit(simulated(directions=up)))
-    assert rating.name == 'USABLE'
+UP = spread_directions(60)
+CORNERS = np.repeat([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], 2, axis=0) / 3.0**0.5
+SLIGHT = {**COMMON, 'quadratic': [0.0015, -0.001, 0.001]}
+RATED = {
+    'the poses do not determine the cross-axis gain': (
+        simulated(directions=np.vstack([FACES, FACES[:3]]) + 1e-3), 'auto', 'USABLE', ''),
+    'nothing checks the model in the other half of the sphere': (
+        simulated(directions=UP[UP[:, 2] > 0.0], noise=0.001), 'auto', 'USABLE', 'not_covered'),
+    'a residual far above the noise and below 1 mg': (
+        simulated(SLIGHT, poses=30, noise=1e-4), 'auto', 'GOOD', ''),
+    'one knocked pose': (changed(simulated(poses=24), 6, plus=0.3), 'auto', 'GOOD', ''),
+    'many knocked poses': (
+        changed(simulated(poses=24), [1, 6, 8, 13, 19],
+                plus=[[0.3], [-0.25], [0.4], [0.2], [-0.35]]), 'auto', 'USABLE', 'outliers'),
+    'worse than none': (simulated({'offset': [0.001, -0.001, 0.0005]}, poses=11, noise=0.25,
+                                  seed=2), '10', 'BAD', 'no_gain'),
+    'right before': (simulated({'offset': [1e-4, 0.0, -1e-4]}, poses=12, noise=0.001), 'auto',
+                     'GOOD', ''),
+    'right before, and noisy': (simulated({'offset': [1e-4, 0.0, -1e-4]}, poses=12, noise=0.02),
+                                'auto', 'USABLE', ''),
+    'each orientation twice': (simulated({'offset': COMMON['offset']}, directions=CORNERS), '4',
+                               'USABLE', 'not_covered'),
+    'each orientation twice, which differ': (
+        changed(simulated({'offset': COMMON['offset']}, directions=CORNERS), [0, 2], plus=0.04),
+        '4', 'BAD', 'no_check')}
+"""Poses, the model of their fit, and its rating, perhaps with the first finding."""
+
+
+@pytest.mark.parametrize('case', RATED)
+def test_a_fit_is_rated_by_what_its_poses_show(case):
+    poses, model, name, kind = RATED[case]
+    rating = rate(ac.fit(poses, model=model))
+    assert rating.name == name
+    assert not kind or rating.findings[0].kind == kind
 
 
 @pytest.mark.parametrize(('kind', 'figures', 'outliers'), [
@@ -96,15 +114,6 @@ def test_a_figure_that_no_useful_calibration_has_makes_it_bad(kind, figures, out
         rejected=tuple(Rejected(row, 'outlier', 'outlier') for row in outliers)))
     assert rating.name == 'BAD'
     assert kind in [each.kind for each in rating.findings if each.level == 'BAD']
-
-
-def test_half_of_the_sphere_is_not_good_because_nothing_checks_the_model_in_the_other():
-    up = spread_directions(60)
-    calibration = ac.fit(simulated(directions=up[up[:, 2] > 0.0], noise=0.001))
-    rating = rate(calibration)
-    assert error_mg(calibration, model_with(COMMON)) < GOOD_MG
-    assert (rating.name, rating.findings[0].kind) == ('USABLE', 'not_covered')
-    assert rating.next.kind == 'poses'
 
 
 @pytest.mark.parametrize(('effects', 'context'), [
@@ -122,14 +131,6 @@ def test_a_hidden_effect_makes_a_fit_usable_and_its_refinement_good(effects, con
     assert next(iter(effects)) in base.reason
 
 
-def test_a_residual_far_above_the_noise_is_ignored_below_a_milli_g():
-    table = simulated({**COMMON, 'quadratic': [0.0015, -0.001, 0.001]}, poses=30, noise=1e-4)
-    calibration = ac.fit(table)
-    assert calibration.quality.chi2_per_dof > 400.0
-    assert Expected(calibration).hidden_mg < 1.0
-    assert rate(calibration).name == 'GOOD'
-
-
 def test_a_fit_beside_a_refused_refinement_is_not_bad():
     table = simulated({'offset': [0.02, 0.0, 0.0], 'quadratic': [0.005, 0.004, -0.005]}, poses=60)
     result = ac.refine(table)
@@ -141,80 +142,29 @@ def test_a_fit_beside_a_refused_refinement_is_not_bad():
     assert rate(refused.calibration, refinement=refused).name == 'BAD'
 
 
-def test_many_knocked_poses_are_usable_and_one_of_many_is_good():
-    table = simulated(poses=24)
-    one = moved(table, [7], 0.3)
-    many = moved(table, [2, 7, 9, 14, 20], [[0.3], [-0.25], [0.4], [0.2], [-0.35]])
-    assert len(ac.fit(one).rejected) == 1
-    assert rate(ac.fit(one)).name == 'GOOD'
-    rating = rate(ac.fit(many))
-    assert (rating.name, rating.next.kind) == ('USABLE', 'poses')
+NEAR = FACES[[0]] + 0.1 * random_directions(12, np.random.default_rng(3))
 
 
-def test_a_calibration_that_is_worse_than_none_is_bad():
-    ideal = {'offset': [0.001, -0.001, 0.0005]}
-    calibration = ac.fit(simulated(ideal, poses=11, noise=0.25, seed=2), model='10')
-    assert error_mg(calibration, model_with(ideal)) > 5.0
-    assert rate(calibration).name == 'BAD'
-
-
-@pytest.mark.parametrize(('noise', 'expected'), [(0.001, 'GOOD'), (0.02, 'USABLE')])
-def test_a_sensor_that_was_right_before_is_good_if_the_error_does_not_matter(noise, expected):
-    rating = rate(ac.fit(simulated({'offset': [1e-4, 0.0, -1e-4]}, poses=12, noise=noise)))
+@pytest.mark.parametrize(('fitted', 'new', 'expected'), [
+    ({'poses': 24}, {'effects': {'offset': [-0.01, 0.005, -0.005]}, 'poses': 12}, 'BAD'),
+    ({'poses': 24}, {'poses': 12, 'noise': 0.1}, 'USABLE'),
+    ({'directions': FACES}, {'directions': NEAR}, 'USABLE')])
+def test_poses_of_another_sensor_are_bad_and_noisy_or_similar_ones_do_not_verify(
+        fitted, new, expected):
+    calibration, poses = ac.fit(simulated(**fitted)), simulated(**new, seed=9)
+    rating = rate_verification(ac.verify(poses, calibration), calibration, poses)
     assert rating.name == expected
 
 
-def tilted():
-    up = np.array([[0, 0, 1], [0.2, 0, 1], [-0.2, 0, 1], [0, 0.2, 1], [0, -0.2, 1]])
-    return simulated(directions=up)
-
-
-@pytest.mark.parametrize('fitted', [fit_partial, mounting_only])
-def test_what_a_robot_cannot_determine_is_stated_once(fitted):
-    kinds = [each.kind for each in rate(fitted(tilted(), MPS2)).findings]
-    assert 'open' in kinds
-    assert not {'omitted', 'new_orientations', 'far_from_poses'} & {*kinds}
-
-
-@pytest.mark.parametrize(('effects', 'noise', 'expected'), [
-    ({'offset': [-0.01, 0.005, -0.005]}, 0.003, 'BAD'), (COMMON, 0.1, 'USABLE')])
-def test_poses_of_another_sensor_are_bad_and_noisy_ones_do_not_verify(effects, noise, expected):
-    calibration = ac.fit(simulated(poses=24))
-    new = simulated(effects, poses=12, noise=noise, seed=9)
-    assert rate_verification(ac.verify(new, calibration), calibration, new).name == expected
-
-
-def test_a_verification_never_advises_to_replace_what_it_verified(tmp_path):
-    other, stored = written(tmp_path / 'other.csv', HIDDEN), tmp_path / 'c.yaml'
-    ac.fit(simulated(poses=24, units='g')).save(stored)
-    target = tmp_path / 'result.json'
-    main(['verify', str(other), '-c', str(stored), '--json', str(target)])
-    step = json.loads(target.read_text(encoding='utf-8'))['next']
-    assert (step['kind'], step['command'].split()) == (
-        'fit', ['accel-calib', 'fit', str(other), '-o', str(tmp_path / 'c_new.yaml')])
-
-
-def test_a_verification_of_few_directions_does_not_improve_the_rating():
-    calibration = ac.fit(simulated(directions=FACES))
-    near = FACES[[0]] + 0.1 * random_directions(12, np.random.default_rng(3))
-    new = simulated(directions=near, seed=9)
-    checked = ac.verify(new, calibration)
-    assert rate_verification(checked, calibration, new).name == 'USABLE'
-
-
-@pytest.mark.parametrize(('offset', 'expected'), [(0.03, 'GOOD'), (0.032, 'USABLE'),
-                                                  (0.06, 'BAD')])
-def test_calibrations_that_differ_are_usable_or_bad(offset, expected):
-    runs = [ac.fit(simulated(poses=24)),
-            ac.fit(simulated({**COMMON, 'offset': [offset, -0.02, 0.04]}, poses=24, seed=7))]
-    assert rate_comparison(ac.compare(runs)).name == expected
-
-
-def test_calibrations_that_are_too_uncertain_to_differ_are_usable():
-    runs = [ac.fit(simulated(poses=10, noise=0.15, seed=seed)) for seed in (1, 2)]
-    comparison = ac.compare(runs)
-    assert comparison.agree
-    assert rate_comparison(comparison).name == 'USABLE'
+@pytest.mark.parametrize(('offset', 'options', 'agree', 'expected'), [
+    (0.03, {'poses': 24}, True, 'GOOD'), (0.032, {'poses': 24}, False, 'USABLE'),
+    (0.06, {'poses': 24}, False, 'BAD'), (0.03, {'poses': 10, 'noise': 0.15}, True, 'USABLE')])
+def test_calibrations_that_differ_or_are_too_uncertain_to_differ_are_not_good(
+        offset, options, agree, expected):
+    comparison = ac.compare([
+        ac.fit(simulated({**COMMON, 'offset': [each, -0.02, 0.04]}, seed=seed, **options))
+        for seed, each in ((1, 0.03), (2, offset))])
+    assert (comparison.agree, rate_comparison(comparison).name) == (agree, expected)
 
 
 def written(path, effects, poses=40):
@@ -283,12 +233,77 @@ def test_after_a_search_without_result_nobody_is_sent_to_search_again(noise_know
     assert (again['rating'], again['next']['kind']) == ('USABLE', 'poses')
 
 
-@pytest.mark.parametrize(('apart', 'name'), [(0.0, 'USABLE'), (0.004, 'BAD')])
-def test_poses_that_disagree_in_orientations_of_which_none_checks_the_others_are_bad(apart, name):
-    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / 3.0**0.5
-    poses = simulated({'offset': COMMON['offset']}, directions=np.repeat(corners, 2, axis=0),
-                      units='g')
-    rating = rate(fit_poses(moved(poses, (1, 3), apart), G, model='4'))
-    assert rating.name == name
-    found = [(each.kind, each.level) for each in rating.findings]
-    assert (('no_check', 'BAD') in found) == (name == 'BAD')
+# The gate: bad rows, absurd numbers and edited files
+
+
+STORED, TWELVE = Path(__file__).parent / 'data', table('twelve_readings')
+
+
+@pytest.mark.parametrize('row', [
+    (0.0, 0.0, 0.0), *((7.6, value, 6.2) for value in (1e150, -1e300, 1e20, 1e6))])
+@pytest.mark.parametrize('model', ['auto', '4', '7', '9', '10'])
+def test_an_impossible_reading_is_left_out_and_named(model, row):
+    expected = fit_poses(poses_of(TWELVE), MPS2, model=model)
+    found = fit_poses(poses_of([*TWELVE, row]), MPS2, model=model)
+    assert [each.row for each in found.rejected] == [13]
+    np.testing.assert_allclose(found.offset, expected.offset, rtol=1e-6)
+    np.testing.assert_allclose(found.gain, expected.gain, rtol=1e-6)
+
+
+@pytest.mark.parametrize('absurd', [
+    {'std': 1e300}, {'std': 1e150}, {'std': 1e5}, {'reading': 1e6, 'std': 1e6}])
+def test_an_absurd_deviation_is_left_out_and_named(absurd):
+    poses = simulate_poses(sensor(np.random.default_rng(1)), spread_directions(14),
+                           np.random.default_rng(2))
+    columns = {key: poses[key].copy() for key in absurd}
+    for key, value in absurd.items():
+        columns[key][5] = value
+    found = fit_poses(poses.with_columns(**columns), G)
+    (rejected,) = found.rejected
+    assert rejected.row == 6
+    assert 'reading' in absurd or 'not at rest' in rejected.reason
+
+
+@pytest.fixture(scope='module')
+def calibration():
+    poses = simulate_poses(sensor(np.random.default_rng(5)), spread_directions(14),
+                           np.random.default_rng(6))
+    return fit_poses(poses, G, model='10', sensor='imu')
+
+
+@pytest.mark.parametrize('values', table('overflowing_effects'))
+def test_values_that_overflow_and_a_residual_that_is_no_number_are_refused(values, calibration):
+    model = Model({name: np.array(part) for name, part in {
+        **calibration.model.values, **values}.items()})
+    covariance = np.zeros((len(model.vector),) * 2)
+    with pytest.raises(RefusedFitError):
+        gated(replace(calibration, model=model, covariance=covariance))
+    with pytest.raises(RefusedFitError, match='the residual is nan mg'):
+        gated(replace(calibration, quality=replace(calibration.quality, rms_after_mg=np.nan)))
+
+
+def test_a_file_edited_by_hand_is_used_with_a_warning_and_its_effects_count(calibration):
+    text, matrix = format_calibration(calibration), calibration.matrix
+    for old, new, kinds in (
+            ('sensor: imu', 'sensor: imu', []), ('sensor: imu', 'sensor: other', ['edited']),
+            (f'[{matrix[0, 0]!s},', '[1.5,', ['edited', 'correction_in_file'])):
+        assert old in text
+        found = parse_calibration(text.replace(old, new, 1), 'x.yaml')
+        assert [each.kind for each in found.noted if each.kind in OF_FILE] == kinds
+        np.testing.assert_array_equal(found.matrix, matrix)
+        assert found.sensor == ('other' if 'other' in new else 'imu')
+        again = parse_calibration(format_calibration(found), 'x.yaml')
+        assert not {each.kind for each in again.noted} & {*OF_FILE}
+
+
+def test_stored_calibrations_still_load_and_correct_as_they_did():
+    corrected = json.loads((STORED / 'calibration_corrected.json').read_text())
+    assert len(corrected) == 4
+    context = {'temperature': np.array([22.0]), 'time': np.array([600.0])}
+    for name, force in corrected.items():
+        found = read_calibration(STORED / name)
+        reading = np.array([[0.3, -0.4, 0.8]]) * found.units.per_g
+        np.testing.assert_allclose(found.correct(reading, context)[0], force, rtol=1e-9)
+        assert np.all(np.isfinite(found.covariance))
+        assert parse_calibration(format_calibration(found), name).model.effects == (
+            found.model.effects)

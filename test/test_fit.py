@@ -11,19 +11,17 @@ import accel_calib as ac
 from accel_calib.calibration import fit_poses, in_g, verify
 from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import (
-    estimate, fit_robust, judge, NotConvergedError, originals, outliers_among, Point, scatter_of,
-    sensing_axes, solve, start_of, variance_factor)
+    fit_robust, judge, NotConvergedError, outliers_among, Point, scatter_of, sensing_axes, solve,
+    variance_factor)
 from accel_calib.finding import has
 from accel_calib.findings import outlook
 from accel_calib.geometry import ATTITUDES
 from accel_calib.table import numbered
 from inside import (
-    agreeing, look_alikes, Model, MODELS, predict, rotation_from_rpy, simulate_poses,
-    spread_directions, unit)
+    agreeing, Model, MODELS, predict, rotation_from_rpy, simulate_poses, spread_directions, unit)
 import numpy as np
 import pytest
-from shared import (
-    attitudes, changed, error_mg, G, MPS2, NATIVE, poses_of, random_directions, sensor)
+from shared import attitudes, changed, error_mg, G, MPS2, poses_of, random_directions, sensor
 
 
 def simulated(seed, count, *effects, known=False):
@@ -49,19 +47,6 @@ def test_auto_takes_the_model_of_the_sensor_and_its_deviations_contain_the_truth
     assert chosen.count(name) >= 10
 
 
-def test_native_units_find_their_own_scale():
-    model, poses = simulated(3, 20)
-    shifted = poses.with_columns(reading=poses.reading * 4060.0 + 33000.0,
-                                 std=poses['std'] * 4060.0)
-    calibration = fit_poses(shifted, NATIVE)
-    true_w, true_v = model.linear_part
-    assert np.all(np.abs(calibration.gain - true_w * 4060.0) < 4 * calibration.gain_sd)
-    assert np.all(np.abs(calibration.offset - true_v * 4060.0 - 33000.0)
-                  < 4 * calibration.offset_sd)
-    force = calibration.correct(shifted.reading)
-    np.testing.assert_allclose(np.linalg.norm(force, axis=1), 1.0, atol=2e-3)
-
-
 def test_nine_parameters_are_ten_in_the_sensing_axes():
     poses = simulated(4, 20)[1]
     nine, ten = fit_poses(poses, G, model='9'), fit_poses(poses, G, model='10')
@@ -69,6 +54,9 @@ def test_nine_parameters_are_ten_in_the_sensing_axes():
     own, axes = (np.hstack(astuple(sensing_axes(fit.gain, fit.offset))) for fit in (nine, ten))
     np.testing.assert_allclose(own, axes, atol=1e-9)
     assert np.linalg.matrix_rank(nine.covariance, tol=1e-14) == 9
+    scatter = scattering(0, 7e-4)[1]
+    nine, ten = (fit_poses(scatter, G, model=name) for name in ('9', '10'))
+    assert nine.offset_sd == pytest.approx(ten.offset_sd, rel=0.02)
 
 
 @pytest.mark.parametrize(('count', 'limit_mg'), [(12, 0.33), (36, 0.2)])
@@ -105,17 +93,21 @@ def scattering(seed, scatter_g, count=60, differs=0.8):
                                      std=np.repeat(10.0 * noise, 3, axis=1))
 
 
-def test_poses_that_scatter_alike_have_weights_alike_and_true_deviations():
+@pytest.mark.parametrize(('name', 'count'), [('10', 60), ('12', 20)])
+def test_poses_that_scatter_alike_have_weights_alike_and_true_deviations(name, count):
     pulls, lost = [], 0
     for seed in range(20):
-        model, poses = scattering(seed, 7e-4)
-        fit = fit_poses(poses, G, model='10')
-        pulls.append((fit.model.vector - model.vector) / np.sqrt(np.diag(fit.covariance)))
+        model, poses = scattering(seed, 7e-4, count)
+        fit = fit_poses(poses, G, model=name)
         lost += len(fit.rejected)
-        assert fit.quality.chi2_per_dof > 4.0  # of the noise as stated
-        assert 'beyond_noise' in [each.kind for each in fit.noted]
+        if fit.name == name:
+            gain, offset = model.linear_part
+            pulls += [np.diag(fit.gain - gain) / np.diag(fit.gain_sd),
+                      (fit.offset - offset) / fit.offset_sd]
+            assert fit.quality.chi2_per_dof > 4.0  # of the noise as stated
+            assert has(fit.noted, 'beyond_noise')
     assert np.std(pulls) == pytest.approx(1.0, abs=0.2)
-    assert lost == 0
+    assert lost <= (2 if name == '12' else 0)
 
 
 @pytest.mark.parametrize('factor', [1.0, 3.0, 100.0])
@@ -125,53 +117,25 @@ def test_overstated_noise_is_noted(factor):
     assert ('below_noise' in [each.kind for each in found.findings]) == (factor > 1.0)
 
 
-@pytest.mark.parametrize('seed', range(8))
-def test_the_scatter_of_a_fit_is_that_of_its_residuals(seed):
-    poses = scattering(seed, 4.2e-4, 100, 1.0)[1]
-    fit, kept = fit_robust('10', poses)
-    size_g = scatter_of(judge(fit.model, poses.take(kept))).size_g
-    assert fit.poses_g['own_scatter'] == pytest.approx(size_g, rel=0.02)
-
-
 def test_few_poses_that_scatter_alike_are_no_outliers():
     lost = [len(fit_poses(scattering(seed, 7e-4, 14, differs)[1], G, model='10').rejected)
             for seed in range(20) for differs in (0.0, 0.8)]
     assert sum(lost) <= 10
 
 
-def test_poses_of_known_orientation_that_scatter_alike_have_true_deviations():
-    inside, lost = [], 0
-    for seed in range(20):
-        model, poses = scattering(seed, 7e-4, 20)
-        fit = fit_poses(poses, G, model='12')
-        lost += len(fit.rejected)
-        if fit.name == '12':
-            away = fit.model.linear_part[0] - model.linear_part[0]
-            inside.append(np.abs(np.diag(away)) < 1.96 * np.diag(fit.gain_sd))
-    assert np.mean(inside) > 0.85
-    assert lost <= 2
-
-
-def test_models_9_and_10_of_poses_that_scatter_have_the_same_deviations():
-    poses = scattering(0, 7e-4)[1]
-    deviations = [np.sqrt(np.diag(fit_poses(poses, G, model=name).covariance)[:3])
-                  for name in ('9', '10')]
-    assert deviations[0] == pytest.approx(deviations[1], rel=0.02)
-
-
-def test_a_scatter_is_estimated_where_the_noise_differs():
-    sizes = [scatter_of(judge(model, poses)).size_g
-             for model, poses in map(scattering, range(10), [7e-4] * 10)]
+def test_a_scatter_is_estimated_where_the_noise_differs_and_is_that_of_the_residuals_of_a_fit():
+    sizes = []
+    for seed in range(10):
+        model, poses = scattering(seed, 7e-4)
+        sizes.append(scatter_of(judge(model, poses)).size_g)
+        fit, kept = fit_robust('10', poses)
+        own = judge(fit.model, poses.take(kept))
+        assert fit.poses_g['own_scatter'] == pytest.approx(scatter_of(own).size_g, rel=0.02)
     assert np.mean(sizes) == pytest.approx(7e-4, rel=0.1)
+    twice = judge(own.model, own.poses_g, np.hstack([own.ties, own.ties]))
+    assert scatter_of(twice) == pytest.approx(scatter_of(own), rel=1e-6)
     model, poses = scattering(0, 0.0)
     assert not scatter_of(judge(model, poses)).shows
-
-
-def test_columns_that_repeat_others_do_not_change_a_scatter():
-    model, poses = scattering(0, 7e-4)
-    fit = judge(model, poses)
-    twice = judge(model, poses, np.hstack([fit.ties, fit.ties]))
-    assert scatter_of(twice) == pytest.approx(scatter_of(fit), rel=1e-6)
 
 
 def test_knocked_poses_are_left_out_beside_a_scatter():
@@ -179,15 +143,6 @@ def test_knocked_poses_are_left_out_beside_a_scatter():
         poses = scattering(seed, 7e-4)[1]
         fit = fit_poses(changed(poses, [7, 30, 51], 1.02), G, model='10')
         assert [each.row for each in fit.rejected] == [8, 31, 52]
-
-
-@pytest.mark.parametrize('seed', range(12))
-def test_a_few_knocked_poses_among_many_are_left_out(seed):
-    rng = np.random.default_rng(seed)
-    poses = simulate_poses(sensor(rng), random_directions(2500, rng), rng)
-    rows = rng.choice(2500, 3, replace=False)
-    fit = fit_poses(changed(poses, rows, 1.02), G, model='10')
-    assert set(rows + 1) <= {each.row for each in fit.rejected}
 
 
 def test_unknown_noise_is_estimated_from_the_residuals():
@@ -300,16 +255,10 @@ def test_a_reader_cannot_change_a_calibration():
 
 @pytest.mark.parametrize('model', ['4', '7', '10', 'auto'])
 def test_readings_without_any_noise_are_fitted(model):
-    units = MPS2
-    edges = poses_of(ATTITUDES[6:18] * units.per_g + [0.3, 0.0, 0.0])
-    calibration = fit_poses(edges, units, model=model)
+    edges = poses_of(ATTITUDES[6:18] * MPS2.per_g + [0.3, 0.0, 0.0])
+    calibration = fit_poses(edges, MPS2, model=model)
     np.testing.assert_allclose(calibration.offset, [0.3, 0.0, 0.0], atol=1e-12)
     assert outlook(calibration, model).uncertainty_mg == pytest.approx(0.0, abs=1e-9)
-
-
-def test_auto_with_as_many_poses_as_parameters_warns():
-    assert has(fit_poses(simulated(9, 9)[1], G, model='10').noted, 'no_check')
-    assert fit_poses(simulated(9, 9)[1], G).name in ('4', '7', '10')
 
 
 def stalled(slope):
@@ -363,18 +312,11 @@ def share_held(ratio, dof, noise_known):
 
 
 @pytest.mark.parametrize(('ratio', 'dof', 'noise_known'), [
-    *product((1.0, 9.0), (27, 91), [True]), (1.0, 3, True),
+    *product((1.0, 9.0), (27, 91), [True]), (1.0, 3, True), (0.04, 91, True),
     *product((0.04, 1.0, 25.0), (3, 27), [False])])
 def test_intervals_contain_the_truth_if_noise_or_residuals_determine_it(ratio, dof, noise_known):
     tolerance = 0.02 if noise_known else 0.01
     assert share_held(ratio, dof, noise_known) == pytest.approx(0.95, abs=tolerance)
-
-
-def test_poses_that_repeat_better_are_believed_and_noise_that_is_assumed_is_increased():
-    assert variance_factor(0.04 * 91, 91, True) < 0.1
-    assert share_held(0.04, 91, noise_known=True) > 0.93
-    assert variance_factor(0.0, 0, True) == 1.0
-    assert variance_factor(0.0, 0, False) > 2.0
 
 
 def knocked(seed, count, bad):
@@ -402,10 +344,12 @@ def test_clean_poses_are_kept_even_if_their_noise_is_underestimated(count, state
     assert sum(map(bool, lost)) <= sets // 20
 
 
-@pytest.mark.parametrize('count', [100, 400])
-def test_all_knocked_poses_are_left_out_but_at_most_a_quarter(count):
-    poses = knocked(7, count, count // 5)
-    assert left_out(poses) == set(poses.row[:count // 5].tolist())
+@pytest.mark.parametrize(('count', 'bad'), [(100, 20), (400, 80), (2500, 3)])
+def test_all_knocked_poses_are_left_out_but_at_most_a_quarter(count, bad):
+    poses = knocked(7, count, bad)
+    found = left_out(poses)
+    assert set(poses.row[:bad].tolist()) <= found
+    assert len(found) <= bad + count // 500
     # A third agrees with another offset.
     shifted = changed(knocked(8, count, 0), np.s_[::3], plus=[0.1, 0.0, 0.0])
     assert len(left_out(shifted)) <= count // 4
@@ -435,19 +379,6 @@ def test_several_fits_together_have_the_outliers_of_each_alone(poses, rows):
     assert [tuple(out.tolist()) for out in found] == knocked
 
 
-@pytest.mark.parametrize(('seed', 'wrong'), [(25, 4), (253, 11)])
-def test_a_pose_that_explains_a_third_of_the_mistake_of_another_is_found(seed, wrong):
-    rng = np.random.default_rng(seed)
-    around, beside = int(rng.integers(11, 20)), int(rng.integers(0, 25))
-    up = random_directions(around, rng)
-    close = unit(up[[3]] + 0.15 * rng.normal(size=(beside, 3)))
-    poses = simulate_poses(sensor(rng), np.vstack([up, close]), rng)
-    poses = changed(poses, wrong, 1.03)
-    kept = np.delete(np.arange(len(poses)), wrong)
-    fit = estimate(start_of('10', poses.take(kept).reading), poses.take(kept))
-    assert list(look_alikes(fit, kept, np.array([wrong]), poses))
-
-
 def with_copies(poses, rows):
     """Return poses followed by exact copies of these rows, 0-based."""
     every = poses.take(np.concatenate([np.arange(len(poses)), rows]).astype(int))
@@ -474,31 +405,6 @@ def test_copies_of_a_pose_make_no_pose_an_outlier(copies, lacks, apart):
         assert found.quality.chi2_per_dof == pytest.approx(once.quality.chi2_per_dof)
 
 
-def test_readings_that_were_measured_again_are_not_copies():
-    poses = knocked(5, 18, 0)
-    by = np.random.default_rng(5).normal(size=(18, 3)) * 3e-4
-    again = changed(with_copies(poses, range(18)), slice(18, None), plus=by)
-    once, found = (fit_poses(each, G, model='10') for each in (poses, again))
-    assert not [line for line in found.warnings if 'equal' in line]
-    assert np.trace(found.covariance) < 0.75 * np.trace(once.covariance)
-
-
-def test_all_copies_of_readings_on_a_coarse_grid_are_found():
-    reading = np.repeat([*product(np.arange(-9, 10) * 1e-3, repeat=3)], 2, axis=0)
-    poses = poses_of(reading, std=np.full(reading.shape, 0.1), count=np.full(len(reading), 100.0))
-    np.testing.assert_array_equal(originals(poses), np.arange(len(reading)) // 2 * 2)
-
-
 def test_poses_that_count_once_are_too_few_for_the_model():
     with pytest.raises(RefusedFitError, match='14 poses have 8 directions'):
         fit_poses(with_copies(knocked(6, 8, 0), range(6)), G, model='10')
-
-
-def test_a_region_that_only_outliers_cover_is_named():
-    up = spread_directions(60)
-    up = np.vstack([up[up[:, 2] < -0.2], [[0.0, 0.0, 1.0]]])
-    poses = ac.simulate({'offset': [0.03, -0.02, 0.04]}, directions=up, units='g')
-    poses = changed(poses, -1, 1.2)
-    found = fit_poses(poses, G, model='10')
-    assert [each.row for each in found.rejected] == [len(up)]
-    assert has(found.noted, 'not_covered')

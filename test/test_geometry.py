@@ -5,9 +5,8 @@
 import re
 
 from accel_calib.calibration import (
-    dilution, error_left_in, fit_poses, flat_direction, identifiability, next_pose)
-from accel_calib.errors import InputError, RefusedFitError
-from accel_calib.findings import request_words
+    dilution, error_left_in, fit_poses, flat_direction, identifiability)
+from accel_calib.errors import RefusedFitError
 from accel_calib.geometry import angle_of, sphere_through
 from accel_calib.table import Poses
 from accel_calib.units import FRAMES
@@ -40,19 +39,6 @@ def named(text):
     """Return the directions that a text such as ``(+x -z)`` names, (n, 3)."""
     return unit(np.array([[(f'+{axis}' in part) - float(f'-{axis}' in part) for axis in 'xyz']
                           for part in re.findall(r'\([+-][+xyz -]*\)', text)]))
-
-
-@pytest.mark.parametrize('model', ['4', '7', '10', '12'])
-def test_undetermined_combinations_change_no_pose(model):
-    directions = RING @ rotation_from_rpy(0.5, 0.4, 0.3).T
-    found = identifiability(model, directions)
-    names = list(found.deviations)
-    rows = rows_of(model, directions).reshape(-1, len(names))
-    assert len(found.undetermined) == len(names) - np.linalg.matrix_rank(rows)
-    for each in found.undetermined:
-        vector = np.array([each.weights.get(name, 0.0) for name in names])
-        assert np.linalg.norm(vector) == pytest.approx(1.0, abs=1e-2)
-        np.testing.assert_allclose(rows @ vector, 0.0, atol=5e-3)
 
 
 @pytest.mark.parametrize(('model', 'noisy'), [('10', 1.0), ('7', 3.0), ('12', 3.0)])
@@ -122,27 +108,12 @@ def test_error_of_a_smaller_model_is_that_of_fits_to_common_sensors(smaller, dir
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(expected, rel=0.12)
 
 
-def test_next_poses_have_words_and_are_far_fewer_than_random_poses():
-    directions = np.zeros((0, 3))
-    while len(directions) < 12:
-        asked = next_pose(directions)
-        np.testing.assert_allclose([asked.direction], named(request_words(asked)))
-        directions = np.vstack([directions, asked.direction])
-    assert identifiability('10', directions).mean_dilution < 0.95
-    at_random = [identifiability('10', random_directions(12, np.random.default_rng(seed)))
-                 .mean_dilution for seed in range(50)]
-    assert np.median(at_random) > 1.4
-
-
 @pytest.mark.parametrize('directions', [FACES, RING[:, :2]])
 def test_points_on_a_sphere_or_a_circle_have_its_radius(directions):
     radius, off = sphere_through(3.0 * directions + 0.5)
     assert radius == pytest.approx(3.0)
     assert off < 1e-12
-
-
-def test_points_that_are_all_the_same_have_no_radius():
-    assert sphere_through(np.zeros((6, 3))) == (0.0, 0.0)
+    assert sphere_through(np.zeros((6, 3))) == (0.0, 0.0)  # the same point has no radius
 
 
 # The mounting: levelling, heading, and axes that are wired wrongly
@@ -187,14 +158,6 @@ def test_levelling_again_keeps_the_heading():
     assert np.linalg.det(found) == pytest.approx(1.0)
     assert angle_of(found.T @ before) < 4.0
     np.testing.assert_array_equal(with_heading_of(before, upright), upright)
-
-
-def test_a_second_pose_near_the_first_and_a_flat_pose_without_gravity_are_refused():
-    with pytest.raises(InputError, match='within 10° of the flat pose'):
-        with_heading(np.eye(3), np.array([0, 0.05, 1.0]))
-    for flat in ((0, 0, 0), (np.nan, 0, 1)):
-        with pytest.raises(InputError, match='expected about 1 g'):
-            mounting(np.array(flat, float))
 
 
 def wired(mat_p, seed=1):

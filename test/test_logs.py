@@ -4,61 +4,34 @@
 """
 Large and hostile logs, and a small log in each format, which is read as the same table.
 
+Samples of the makers' layouts are read, captured and fitted, and the truth is found.
+
 The golden cases `logs_…` read small ones of all dialects, what is refused, and what is special.
 
 """
 
 from pathlib import Path
-import sys
 import tracemalloc
-from typing import Any
 import zipfile
 
+from accel_calib.calibration import fit_poses, level_by_rows
 from accel_calib.errors import InputError
 from accel_calib.fleet import recordings
-from accel_calib.logs import FORMATS, LogOptions, open_log, read_poses, SUFFIXES
+from accel_calib.logs import FORMATS, LogOptions, open_log, SUFFIXES
+from accel_calib.stillness import capture
 from accel_calib.table import Recording
-from inside import model_with, read_log, simulate_recording, spread_directions
+from data.logs import make
+from inside import read_log, spread_directions
 import numpy as np
 import pytest
-from shared import data, GRAVITY as G, little_memory, LOG_CORPUS, options_of, run_json
+from shared import data, little_memory, LOG_CORPUS, LOGS, options_of, run_json
 
-RATE_HZ = 100.0
-OFFSET = np.array([0.03, -0.02, 0.05])
-GAIN = np.array([1.01, 0.98, 1.02])
-NOISE = 0.002
+WITHIN_SD = 5.0
 
 
-def samples(seed: int = 1, per_g: float = G, *, poses: int = 12, rest: int = 200, turn: int = 80
-            ) -> dict[str, np.ndarray]:
-    """Return time [s], readings with `per_g` to the g, and rates [rad/s] of a recording."""
-    rng = np.random.default_rng(seed)
-    made = simulate_recording(
-        model_with({'offset': OFFSET, 'axis_gain': GAIN - 1.0}),
-        spread_directions(poses)[rng.permutation(poses)], rng, noise_g=NOISE, rate_hz=RATE_HZ,
-        dwell=rest / RATE_HZ, turn=turn / RATE_HZ, gyro_noise=0.001)
-    return {'time': made['time'].copy(), 'reading': per_g * made.reading, 'rate': made['rate']}
-
-
-def rows_of(*columns: np.ndarray, digits: str = '.9g') -> list[list[str]]:
-    """Return the cells of rows, from columns of numbers."""
-    parts = [[[format(value, digits) for value in row]
-              for row in np.reshape(column, (len(column), -1)).tolist()] for column in columns]
-    return [[cell for part in row for cell in part] for row in zip(*parts, strict=True)]
-
-
-def text_of(rows: list[list[str]], header: str) -> str:
-    return '\n'.join([header, *map(','.join, rows)]) + '\n'
-
-
-def write(folder: Path, content: Any, name: str = 'log.csv') -> Path:
-    """Write text, bytes, or what a function of the path writes."""
-    path = folder / name
-    if callable(content):
-        content(path)
-    else:
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
-    return path
+def write(folder: Path, text: str) -> Path:
+    (folder / 'log.csv').write_text(text, encoding='utf-8')
+    return folder / 'log.csv'
 
 
 def test_a_cut_last_line_is_left_out_and_noted_also_alone_in_its_block(tmp_path: Path) -> None:
@@ -89,19 +62,20 @@ def test_a_table_of_100000_columns_is_read(tmp_path: Path) -> None:
 
 
 def test_more_rows_than_a_person_poses_are_samples(tmp_path: Path) -> None:
-    poses = G * spread_directions(1500)
+    path, poses = tmp_path / 'log.csv', 9.80665 * spread_directions(1500)
+    np.savetxt(path, poses, delimiter=',', header='ax,ay,az', comments='')
     with pytest.raises(InputError, match='look like samples'):
-        read_log(write(tmp_path, text_of(rows_of(poses), 'ax,ay,az')))
-    timed = rows_of(np.arange(1500) * 5.0, poses)
-    log = read_log(write(tmp_path, text_of(timed, 'time,ax,ay,az')))
-    assert isinstance(log.table, Recording)
+        read_log(path)
+    np.savetxt(path, np.column_stack([np.arange(1500) * 5.0, poses]), delimiter=',',
+               header='time,ax,ay,az', comments='')
+    assert isinstance(read_log(path).table, Recording)
 
 
 def test_a_long_log_is_read_in_blocks_of_flat_memory_as_at_once(tmp_path: Path) -> None:
-    block = rows_of(samples(per_g=1000.0, poses=10, rest=400, turn=100)['reading'], digits='.6g')
+    block = np.round(1000.0 * make.recording(1, rate_hz=100.0).reading, 3).tolist()
     peaks = []
     for times in (40, 100):
-        lines = [f'{10 * k},{",".join(row)}\n' for k, row in enumerate(block * times)]
+        lines = [f'{10 * k},{x},{y},{z}\n' for k, (x, y, z) in enumerate(block * times)]
         path = write(tmp_path, ''.join(['millis,accX,accY,accZ\n', *lines]))
         tracemalloc.start()
         with open_log(path) as log:
@@ -159,14 +133,6 @@ def test_every_format_is_tested_and_fleet_finds_what_is_read(tmp_path: Path) -> 
     assert sorted(each.inside for each in recordings([str(tmp_path)])) == sorted(names)
 
 
-@pytest.mark.parametrize('suffix', ['.h5', '.feather'])
-def test_a_missing_library_is_named(suffix: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = next(path for path in SAME if path.suffix == suffix)
-    monkeypatch.setitem(sys.modules, LIBRARIES[suffix], None)
-    with pytest.raises(InputError, match=f'needs it .*pip install {LIBRARIES[suffix]}'):
-        read_log(path)
-
-
 @pytest.mark.parametrize('path', [*NOT_READ, *sorted((LOG_CORPUS / 'damaged').iterdir())],
                          ids=lambda path: path.name)
 def test_what_is_not_read_is_refused_in_one_line_with_little_memory(path: Path) -> None:
@@ -195,27 +161,39 @@ def test_logs_of_others_become_poses(name: str, poses: int, tmp_path: Path,
     assert made['poses'] == poses
 
 
-@pytest.mark.parametrize(('scale', 'zero', 'empty', 'read', 'words'), [
-    (1.0, 0.0, 0, True, ''), (1.0, 273.15, 0, False, 'about 29'), (1000.0, 0.0, 0, False, 'about'),
-    (340.0, -36.53, 0, False, 'about -'), (1.0, 0.0, 3, False, '3 of 24 cells')])
-def test_a_temperature_that_is_not_in_degrees_or_has_holes_is_left_out_by_name(
-        tmp_path, scale, zero, empty, read, words):
-    rng = np.random.default_rng(5)
-    temperature = scale * (rng.uniform(15.0, 35.0, 24) + zero)
-    rows = rows_of(G * spread_directions(24), temperature, np.full(24, 100))
-    for row in rng.permutation(24)[:empty]:
-        rows[row][3] = ''
-    poses = read_poses(write(tmp_path, text_of(rows, 'ax,ay,az,temperature,count')))
-    assert ('temperature' in poses) is read
-    assert [words in each.text for each in poses.findings] == [True] * (not read)
+# Samples of the makers' layouts
 
 
-@pytest.mark.parametrize(('order', 'words'), [
-    (lambda time, rng: np.zeros(len(time)), 'are equal'),
-    (lambda time, rng: rng.permutation(time), 'before that of the row above')])
-def test_times_that_are_no_clock_are_named_before_anything_is_captured(tmp_path, order, words):
-    made = samples(poses=3)
-    time = order(made['time'], np.random.default_rng(4))
-    path = write(tmp_path, text_of(rows_of(time, made['reading']), 'time,ax,ay,az'))
-    with pytest.raises(InputError, match=words):
-        read_log(path)
+@pytest.mark.parametrize('name', make.TRUTHS)
+def test_the_truth_of_a_sample_is_found_without_options_and_with_its_format(name: str) -> None:
+    for end, library in (('.ulg', 'pyulog'), ('.bin', 'pymavlink'), ('.xls', 'xlrd')):
+        if name.endswith(end):
+            pytest.importorskip(library)
+    log, truth = read_log(LOGS / name), make.TRUTHS[name]
+    assert isinstance(log.table, Recording)
+    poses = capture(log.table, log.units).poses
+    assert (log.units.name, len(poses)) == (truth.units, make.POSES)
+    fitted = fit_poses(poses, log.units, model='10')
+    assert np.all(np.abs(fitted.offset - truth.offset) < WITHIN_SD * fitted.offset_sd)
+    assert np.all(np.abs(fitted.gain - truth.gain) < WITHIN_SD * fitted.gain_sd)
+    assert ('temperature' in log.table) == truth.temperature
+    if truth.rate:
+        assert np.ptp(log.table['rate'], axis=0).max() > 1.0  # rad/s, in the turns
+        assert np.abs(np.median(log.table['rate'], axis=0)).max() < 0.01
+    if truth.temperature:
+        assert np.ptp(log.table['temperature']) == pytest.approx(np.ptp(make.WARM), rel=0.05)
+    assert log.table['time'][-1] - log.table['time'][0] == pytest.approx(44.75, abs=0.01)
+    named = read_log(LOGS / name, LogOptions(format=name.split('/')[0]))
+    assert named.units == log.units
+    np.testing.assert_allclose(named.table.reading, log.table.reading, rtol=1e-12)
+    np.testing.assert_allclose(named.table['time'], log.table['time'], rtol=1e-12)
+
+
+def test_a_flat_pose_makes_a_level_vehicle_read_up() -> None:
+    log = read_log(LOGS / 'px4/log_sensor_accel_0.csv')
+    poses = capture(log.table, log.units).poses  # type: ignore[arg-type]
+    fitted = fit_poses(poses, log.units, model='10')
+    calibration = level_by_rows(fitted, poses, 'ros', 1, None)
+    up = calibration.apply(poses.reading[:1])[0] / log.units.per_g
+    np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=2e-3)
+    np.testing.assert_allclose(calibration.rotation, make.FRD, atol=2e-2)

@@ -26,6 +26,7 @@ from accel_calib.stillness import cells_of, Ramp, ramp_of
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Recording
 from accel_calib.units import MG
+from data.logs import make
 from driven import Driver
 from faults.sample import sample
 from inside import Intake, RampIntake, thermally_calibrated
@@ -35,7 +36,6 @@ from ramps import BENT, G, LINE, offset_at, ramp, twelve_poses, TWISTED, UP, war
 from scipy.signal import medfilt
 from shared import MPS2, refused, rms, run, run_json
 from test_exports import qgroundcontrol
-from test_log_formats import make
 
 
 def stretches(log: Recording) -> Ramp:

@@ -65,7 +65,7 @@ def _of_case(case: dict[str, Any]) -> Any:
 
 
 def _read(folder: str) -> Any:
-    """Return what each log of a folder of the corpus holds, or its refusal."""
+    """Return what each log of a folder of the corpus holds, with its findings, or its refusal."""
     Path(folder).symlink_to(LOG_CORPUS / folder)
     found = {}
     for path in sorted(Path(folder).iterdir()):
@@ -73,7 +73,7 @@ def _read(folder: str) -> Any:
             log = attempt(read_log, path, LogOptions(**options))
             found[f'{path.stem} {options or ""}'.strip()] = (
                 [log, log.read_as] if isinstance(log, AccelCalibError) else
-                [type(log.table).__name__, log.table.row, log])
+                [type(log.table).__name__, log.table.row, log, *log.table.findings])
     return found
 
 

@@ -121,25 +121,6 @@ def combined_fields(samples: Recording) -> Fields:
             'gyro_calibration_count': ('uint8_t', [1] * n)}
 
 
-def imu_fields(samples: Recording, device: int) -> Fields:
-    """Return vehicle_imu: changes of velocity and angle over 5 ms."""
-    time, n, span = stamps_us(samples), len(samples), 5000
-    change, angle = ((values * span * 1e-6).T.tolist()
-                     for values in (samples.reading * G, samples['rate']))
-    return {'timestamp': ('uint64_t', [each + 300 for each in time]),
-            'timestamp_sample': ('uint64_t', time),
-            'accel_device_id': ('uint32_t', [device] * n),
-            'gyro_device_id': ('uint32_t', [device + 1] * n),
-            **{f'delta_angle[{k}]': ('float', angle[k]) for k in range(3)},
-            **{f'delta_velocity[{k}]': ('float', change[k]) for k in range(3)},
-            'delta_angle_dt': ('uint16_t', [span] * n),
-            'delta_velocity_dt': ('uint16_t', [span] * n),
-            'delta_angle_clipping': ('uint8_t', [0] * n),
-            'delta_velocity_clipping': ('uint8_t', [0] * n),
-            'accel_calibration_count': ('uint8_t', [1] * n),
-            'gyro_calibration_count': ('uint8_t', [1] * n)}
-
-
 def ulog_bytes(messages: Sequence[tuple[str, int, Fields]],
                parameters: Mapping[str, float] = {}) -> bytes:
     """
