@@ -25,7 +25,7 @@ from generator import basis_of, EFFECTS, ON_OUTPUT, OUTSIDE, Setup, Simulated, S
 import numpy as np
 from scipy.optimize import least_squares
 
-CATALOGUE = tuple(name for name in EFFECTS if name not in OUTSIDE)
+CATALOGUE = tuple(name for name in EFFECTS if name not in (*OUTSIDE, 'creep'))
 ALIKE = ({'quadratic', 'gain_asymmetry', 'cross_coupling'}, {'cubic', 'odd_quadratic'},
          {'offset_drift', 'warm_up', 'offset_step'}, {'gain_drift', 'gain_step'})
 PAIRED = tuple(name for name in CATALOGUE if name not in (*ON_OUTPUT, 'offset_wander'))
@@ -165,6 +165,8 @@ GROUPS: dict[str, tuple[Group, ...]] = {
         replace(hide_each(('offset_temperature', 'gain_temperature'), 3.0), columns=count,
                 what=f'size 3, beside {count - 1} of noise') for count in (1, 10)),
     'noise_columns': (replace(hide('25 columns of noise', {}, Setup()), columns=25),),
+    'memory': (hide('hysteresis of two turns', {'hysteresis': 3.0}, Setup(hysteresis='memory')),
+               hide('creep', {'creep': 3.0}, Setup())),
 }
 """The groups of each row; the seeds depend on the order of the rows."""
 
@@ -194,7 +196,7 @@ def true_form_error_mg(made: Simulated, fresh: Simulated) -> float | None:
     function with a few values.
 
     """
-    if any(name in (*ON_OUTPUT, *OUTSIDE, 'offset_wander') for name in made.values):
+    if any(name in (*ON_OUTPUT, 'offset_wander') for name in made.values):
         return None
     scales = [float(np.linalg.norm(value)) for value in made.values.values()]
     ends = np.cumsum([len(value) for value in made.values.values()])

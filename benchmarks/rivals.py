@@ -27,13 +27,13 @@ from accel_calib.refinement.linear import SEEN
 from accel_calib.refinement.state import candidates, orthonormal
 from accel_calib.statistics import rms
 from accel_calib.table import Floats, Poses
-from accel_calib.units import units_of
+from accel_calib.units import MG, units_of
 from figures import Frame, markdown
-from generator import again, basis_of, simulate, Simulated
+from generator import again, simulate
 import numpy as np
 from pysindy.optimizers import STLSQ
 from refine import BASE, run_case
-from refine_sets import Case, cases_of, PAIRED
+from refine_sets import Case, cases_of, PAIRED, true_form_error_mg
 import scipy
 from sensors import poses_of
 from sklearn.gaussian_process import GaussianProcessRegressor
@@ -216,18 +216,6 @@ def error_of_process(each: Library) -> float:
     return each.fresh.error(found.predict(each.fresh.recorded))
 
 
-def error_of_oracle(each: Library, made: Simulated, other: Simulated) -> float:
-    """Return the error of other poses with the true form, fitted to the poses [g]."""
-    def columns(truth: Simulated, side: Side) -> Floats:
-        along = truth.around.force @ np.linalg.inv(truth.traits.gain)
-        return np.hstack([side.base, *(
-            np.einsum('ni,nip->np', along, basis_of(name, truth.around, truth.traits))
-            / side.scale[:, np.newaxis] for name in truth.values)])
-
-    values = np.linalg.lstsq(columns(made, each.taken), each.taken.residual, rcond=None)[0]
-    return each.fresh.error(columns(other, each.fresh) @ values)
-
-
 Judged = Mapping[str, tuple[bool | None, float]]
 """By way: whether it names exactly the hidden effects, None if it cannot, and error over base."""
 
@@ -248,7 +236,7 @@ def judge_ways(case: Case) -> Judged:
                  if np.any(values[block])}
         found[name] = named == set(case.hidden), each.error(values) / base
     found['Gaussian process'] = None, error_of_process(each) / base
-    found['oracle'] = None, error_of_oracle(each, made, other) / base
+    found['oracle'] = None, (true_form_error_mg(made, other) or np.nan) / MG / base
     return found
 
 

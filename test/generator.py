@@ -71,9 +71,10 @@ class Setup:
         Course of the temperature.
     rates : {'any', 'small', 'sizeable'}
         Angular rates; any: one of the others. They are sizeable if a lever arm is hidden.
-    hysteresis : {'unit', 'sign', 'previous'}
+    hysteresis : {'unit', 'sign', 'memory', 'previous'}
         Quantity to which hysteresis is proportional, by axis: the unit vector from the present
-        force to the previous one, the sign of this difference, or the previous force.
+        force to the previous one, the sign of this difference, the unit vector and a part of that
+        of the turn before, or the previous force.
     knocked : int
         Number of poses with an error of 10 to 50 mg.
     dropped : tuple of str
@@ -307,7 +308,7 @@ def _traits(rng: np.random.Generator, setup: Setup, around: Around) -> Traits:
                   rng.uniform(0.0, 2.0 * np.pi, 3), walk, rng.normal(size=(n, 3)),
                   setup.hysteresis, more.uniform(0.1, 0.3, 3), float(knee),
                   _instant(more, elapsed), more.uniform(0.1, 0.3) * span, _flicker(more, elapsed),
-                  unit(more.normal(size=3)))
+                  unit(more.normal(size=3)), more.uniform(10.0, 60.0), more.uniform(0.3, 0.9))
 
 
 def _instant(rng: np.random.Generator, elapsed: Floats) -> float:
@@ -406,7 +407,9 @@ def _named(name: str, values: Floats, traits: Traits) -> dict[str, float]:
     factor = HOUR if name in ('offset_drift', 'gain_drift') else 1.0
     named = dict(zip(names.get(name, ('x', 'y', 'z')), (values * factor).tolist(), strict=True))
     more = {'warm_up': {'tau': traits.tau}, 'offset_step': {'instant': traits.instant},
-            'gain_step': {'instant': traits.gain_instant}}
+            'gain_step': {'instant': traits.gain_instant}, 'creep': {'tau': traits.relaxation}}
+    if traits.hysteresis == 'memory':
+        more['hysteresis'] = {'memory': traits.memory}
     return {**named, **more.get(name, {})}
 
 

@@ -104,6 +104,9 @@ class Traits:
         1/f noise in time.
     oblique : (3,) array
         Unit vector along which the oblique effects are a function of the force.
+    relaxation, memory : float
+        Time constant of the creep [s], and part of a hysteresis that the turn before the last one
+        leaves.
 
     """
 
@@ -123,6 +126,8 @@ class Traits:
     gain_beat: float
     flicker: Floats
     oblique: Floats
+    relaxation: float
+    memory: float
 
 
 def unit(vectors: Floats) -> Floats:
@@ -178,9 +183,18 @@ def _ratiometric(around: Around, traits: Traits) -> Floats:
 def _hysteresis(around: Around, traits: Traits) -> Floats:
     u = around.force
     before = np.vstack([u[:1], u[:-1]])
-    shapes = {'unit': unit(before - u), 'sign': np.sign(before - u),
+    way = unit(before - u)
+    shapes = {'unit': way, 'sign': np.sign(before - u),
+              'memory': way + traits.memory * np.vstack([np.zeros(3), way[:-1]]),
               'previous': np.where(np.arange(len(u))[:, np.newaxis] > 0, before, 0.0)}
     return shapes[traits.hysteresis]
+
+
+def _creep(around: Around, traits: Traits) -> Floats:
+    """Return what is left of the relaxation since the pose before, along the way from it."""
+    u, since = around.force, np.diff(around.elapsed, prepend=0.0)
+    way = unit(np.vstack([u[:1], u[:-1]]) - u)
+    return way * np.exp(-since / traits.relaxation)[:, np.newaxis]
 
 
 def _centripetal(around: Around, traits: Traits) -> Floats:
@@ -229,6 +243,7 @@ EFFECTS: dict[str, Callable[[Around, Traits], Floats] | None] = {
     'wander_1f': _by_axis(lambda a, t: t.flicker),
     'oblique_cubic': _same(lambda a, t: (a.force @ t.oblique) ** 3),
     'oblique_hinge': _same(lambda a, t: np.maximum(a.force @ t.oblique, 0.0)),
+    'creep': _by_axis(_creep),
 }
 """The (n, 3, p) basis of each effect with p values; None for effects on the output."""
 
