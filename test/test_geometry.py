@@ -7,13 +7,13 @@ import re
 from accel_calib.calibration import (
     dilution, error_left_in, fit_poses, flat_direction, identifiability)
 from accel_calib.errors import RefusedFitError
-from accel_calib.geometry import angle_of, sphere_through
+from accel_calib.geometry import sphere_through
 from accel_calib.table import Poses
 from accel_calib.units import FRAMES
 from inside import (
     axes_of, determines, fault_of, missing_poses, model_with, MODELS, mounting, poses_needed,
     predict, refuse_if_unfit, rotation_from_rpy, rows_of, simulate_poses, spread_directions, unit,
-    with_heading, with_heading_of)
+    with_heading)
 import numpy as np
 import pytest
 from shared import attitudes, changed, FACES, G, random_directions, sensor
@@ -148,16 +148,6 @@ def test_a_pose_with_the_nose_down_fixes_the_heading(rpy, frame, nose_down):
     levelled = mounting(truth @ flat_direction(frame), frame)
     found = with_heading(levelled, truth @ nose_down, frame)
     np.testing.assert_allclose(found, truth, atol=1e-12)
-
-
-def test_levelling_again_keeps_the_heading():
-    before = rotation_from_rpy(*np.radians((10.0, -20.0, 130.0)))
-    level = mounting(rotation_from_rpy(*np.radians((3.0, 2.0, 0.0))) @ before[:, 2])
-    found, upright = with_heading_of(before, level), mounting(before[:, 0])
-    np.testing.assert_allclose(found[:, 2], level[:, 2], atol=1e-12)
-    assert np.linalg.det(found) == pytest.approx(1.0)
-    assert angle_of(found.T @ before) < 4.0
-    np.testing.assert_array_equal(with_heading_of(before, upright), upright)
 
 
 def wired(mat_p, seed=1):
