@@ -127,10 +127,11 @@ class Session(Holder):
                 and 'temperature' not in topics and math.isnan(state.around.temperature)):
             self.log('warning', f'no temperature arrives; {way_of("temperature", state)}',
                      'thermometers', 10.0 * _FAULT_AGAIN)
-        for column in topics:
-            lack, have = state.sensor.live.lacking(column)
-            if lack and have:
-                self.log('info', f'{lack} of {counted(lack + have, "pose")} have no {column}, '
+        poses = state.sensor.live.poses()
+        for column in filter(poses.__contains__, topics):
+            lack = int(np.sum(np.isnan(poses[column])))
+            if 0 < lack < len(poses):
+                self.log('info', f'{lack} of {counted(len(poses), "pose")} have no {column}, '
                          'so that ~/refine cannot use it', f'poses without {column}',
                          10.0 * _FAULT_AGAIN)
 

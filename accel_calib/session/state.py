@@ -83,8 +83,6 @@ class Sensor:
         Number of poses of the last fit; 0 if more poses are asked for.
     auto_fit_waits : bool
         Whether poses wait for an automatic fit.
-    refusal : str
-        Why the last automatic fit was refused; empty if it was not.
     owners : set of str
         Sensors that the stored files name.
     drift : Drift or None
@@ -107,7 +105,6 @@ class Sensor:
     changes: int = 0
     fitted_poses: int = 0
     auto_fit_waits: bool = False
-    refusal: str = ''
     owners: frozenset[str] = frozenset()
     drift: Drift | None = None
     rest: Dwell | None = None
