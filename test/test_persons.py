@@ -397,15 +397,6 @@ def test_an_offered_calibration_waits_for_save_and_is_reported_as_not_in_use() -
     assert figures(driver)['in_use'] is True
 
 
-@pytest.mark.parametrize('command', ['set_level', 'calibrate_at_rest'])
-def test_a_mounting_alone_is_reported(command: str) -> None:
-    driver = Driver(auto_capture=False)
-    Person(driver, healthy).rest([0.1, 0.0, 1.0], 4.0)
-    driver.ask(command)
-    assert figures(driver)['rotation'][2] != [0.0, 0.0, 1.0]
-    assert not driver.logged('error')
-
-
 def test_slow_motion_by_hand_is_named_while_a_pose_is_waited_for() -> None:
     driver = Driver()
     Person(driver, healthy).rest([0.0, 0.0, 1.0])

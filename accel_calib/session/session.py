@@ -27,7 +27,7 @@ from .state import new_sensor
 from .store import SensorFiles, store_of
 from .stream import AGAIN, SILENT
 from .use import adopt, Holder, open_files, show_mounting, show_poses
-from .worker import answered, ShowPoses, Still, Task
+from .worker import answered, Still, Task
 from ..comparison import status
 from ..findings import mounting_words
 from ..logs import named_topics
@@ -248,16 +248,13 @@ class Session(Holder):
     # The sensor and its files
 
     def _show_frame(self) -> None:
-        """Show poses and mounting in the frames, which have changed."""
+        """Show the mounting in the frames, which have changed."""
         frame_id, settings = self.state.frame_id, self.state.settings
         if frame_id and settings.rotate and frame_id == settings.output_frame_id:
             self.log('warning', f'output_frame_id is {frame_id!r}, the frame of the sensor: TF '
                      'turns levelled messages twice; choose another output_frame_id, or set '
                      'rotate to false')
         show_mounting(self)
-        plan = self.sensor.guide.plan
-        if plan is not None:
-            self.events.append(ShowPoses(plan.up, frame_id or ''))
 
     def _begin(self, run: Callable[[Task], object]) -> bool:
         """
