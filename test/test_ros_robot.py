@@ -4,7 +4,6 @@
 """What a robot in the field meets: transforms, several drivers, QoS, a preview, signals, kills."""
 
 from collections.abc import Callable
-import json
 import math
 from pathlib import Path
 import re
@@ -29,7 +28,7 @@ from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, Temperature
 from shared import GRAVITY, Readings, Stored, wait
-from std_msgs.msg import Bool, String
+from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 from test_ros_watch import free_port, page_link
 from viewer import Viewer
@@ -193,7 +192,8 @@ def test_one_rest_gives_gyro_bias_mounting_and_the_offset_along_gravity(bench: A
 
 def test_a_fit_waits_for_confirmation_on_the_preview(bench: Any, readings: Readings) -> None:
     preview = bench.listen(Imu, 'calibrator/preview')
-    bench.calibrator(sensor='arm', passthrough=True, confirm=True)
+    bench.calibrator(sensor='arm', passthrough=True, confirm=True, rotate=False,
+                     mounting_rpy=[0.5, 0.0, 0.0])
     bench.feed(readings(spread_directions(12)))
     path = bench.home / 'accel_calib' / 'arm.yaml'
     for end in ('undo', 'save'):
@@ -202,28 +202,13 @@ def test_a_fit_waits_for_confirmation_on_the_preview(bench: Any, readings: Readi
         assert not path.exists()
         raw = bench.imu([0.3, 0.4, 9.7])
         bench.exchange(preview, lambda raw=raw: raw)
-        assert np.linalg.norm(force_of(preview[-1]) - [0.3, 0.4, 9.7]) > 0.05
+        assert preview[-1].header.frame_id == raw.header.frame_id
+        assert 0.05 < np.linalg.norm(force_of(preview[-1]) - [0.3, 0.4, 9.7]) < 1.0
         assert bench.exchange(bench.came_out, lambda raw=raw: raw) == raw
         assert bench.call(end).success
         assert path.exists() is (end == 'save')
-    results = bench.listen(String, 'calibrator/result', latched=True)
-    bench.spin(lambda: results and json.loads(results[-1].data)['in_use'])
-    np.testing.assert_allclose(json.loads(results[-1].data)['offset'],
-                               read_calibration(path).offset, atol=1e-9)
     bench.send_until(lambda: bench.imu([0.3, 0.4, 9.7]), lambda: np.linalg.norm(
         force_of(bench.came_out[-1]) - [0.3, 0.4, 9.7]) > 0.05)
-
-
-def test_a_preview_is_in_the_frame_of_the_messages(
-        bench: Any, stored: Stored, readings: Readings) -> None:
-    preview = bench.listen(Imu, 'calibrator/preview')
-    bench.calibrator(calibration_file=stored(flat=[0.4, 0.0, 0.9]), confirm=True, rotate=False)
-    bench.feed(readings(spread_directions(12)))
-    assert bench.call('fit').success
-    offered, used = (bench.exchange(heard, lambda: bench.imu([0.3, 0.4, 9.7]))
-                     for heard in (preview, bench.came_out))
-    assert offered.header.frame_id == used.header.frame_id == 'imu_link'
-    np.testing.assert_allclose(force_of(offered), force_of(used), atol=0.5)
 
 
 # Start and end

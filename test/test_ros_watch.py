@@ -19,14 +19,12 @@ import termios
 import threading
 from typing import Any
 
-from accel_calib.stored import read_calibration
 from faults.sample import sample
 from inside import CALIBRATOR, COMMAND, spread_directions
-import numpy as np
 import pytest
 import rcl_interfaces.msg
 from shared import Readings, wait
-from viewer import fetch, link_of, Viewer
+from viewer import link_of, Viewer
 
 WATCH = (*COMMAND, 'watch')
 ATTITUDES = ([0, 0, 1], [1, 0, 0], [0, 1, 0])
@@ -148,16 +146,9 @@ def test_a_whole_calibration_through_the_page_of_a_node_that_ends_and_logs_no_to
     bench.feed(readings(DIRECTIONS))
     bench.spin(lambda: len(viewer.of('poses')[-1]['up']) >= len(DIRECTIONS))
 
-    offered = viewer.ask('fit', bench.spin)
-    assert offered['success'], offered['words']
-    assert viewer.state['preview']
-    assert not path.exists()
-    bench.spin(lambda: viewer.state['rating'])
-
-    assert viewer.ask('save', bench.spin)['success']
-    np.testing.assert_allclose(read_calibration(path).offset / 9.80665, [0.03, -0.02, 0.04],
-                               atol=5e-4)
-    assert not viewer.state['preview']
+    for command in ('fit', 'save'):
+        assert viewer.ask(command, bench.spin)['success']
+        assert (viewer.state['preview'], path.exists()) == (command == 'fit', command == 'save')
     bench.feed(readings(DIRECTIONS[:1]))
     bench.spin(lambda: abs((viewer.of('progress')[-1]['corrected'] or 0.0) - 1.0) < 0.003)
     count = len(viewer.of('progress'))
@@ -165,9 +156,6 @@ def test_a_whole_calibration_through_the_page_of_a_node_that_ends_and_logs_no_to
         bench.send(bench.imu([0.0, 0.0, 9.80665 * (1.0 + 0.01 * k)]))
     bench.spin(lambda: any(math.isclose(each['length'] or 0.0, 1.09, abs_tol=1e-6)
                            for each in viewer.of('progress')[count:]))
-
-    assert b'<svg' in fetch(viewer.base + viewer.state['page'])[2]
-    assert b'void' in fetch(viewer.base + '/export/c', Authorization=f'Bearer {viewer.token}')[2]
 
     assert viewer.ask('undo', bench.spin)['success']
     assert viewer.state['result'] is None

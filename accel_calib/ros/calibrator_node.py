@@ -133,7 +133,7 @@ class Calibrator:
                               lambda: self.stream.flush())
         self._progress_at = 0.0
         self._shown: ShowPoses | None = None
-        self._drawn: NextStep | None = None  # that of the last markers of these poses
+        self._drawn: tuple[NextStep, str] | None = None  # with the frame, of their last markers
         self._still = node.create_publisher(Bool, '~/still', LATCHED)
         self._poses = node.create_publisher(MarkerArray, '~/poses', LATCHED)
         self._progress = node.create_publisher(DiagnosticStatus, '~/progress', LATCHED)
@@ -242,10 +242,11 @@ class Calibrator:
 
     def _show_poses(self) -> None:
         """Publish new markers if somebody listens: to make them takes 5 ms."""
-        poses, step = self._shown, next_step(self.session.state)
-        if poses is not None and step != self._drawn and self._poses.get_subscription_count():
-            self._poses.publish(pose_markers(poses.up, step, poses.frame_id))
-            self._drawn = step
+        poses, state = self._shown, self.session.state
+        new = next_step(state), state.frame_id or ''
+        if poses is not None and new != self._drawn and self._poses.get_subscription_count():
+            self._poses.publish(pose_markers(poses.up, *new))
+            self._drawn = new
 
     def _show(self, event: Event) -> None:
         if self._page is not None:

@@ -121,11 +121,8 @@ def _auto_fit(session: Holder, sensor: Sensor) -> Task:
         session.change_sensor(auto_fit_waits=True)
         return ''
     except RefusedFitError as error:
-        if session.sensor.refusal == str(error):
-            return ''
-        session.change_sensor(refusal=str(error))
-        raise
-    session.change_sensor(refusal='')
+        session.log('warning', str(error), str(error), math.inf)
+        return ''
     if not use.differs(before, fitted.calibration):
         return ''
     return (yield from _use(session, fitted, offers=False))

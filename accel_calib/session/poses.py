@@ -144,11 +144,6 @@ class LiveCapture:
         return [dwell for band in bands.values()
                 for dwell in select(band, self._settings, self._units)]
 
-    def lacking(self, column: str) -> tuple[int, int]:
-        """Return how many dwells have no value in a column of the context, and how many have."""
-        known = [column in each.context for each in (*self._earlier, *self._dwells, *self._held)]
-        return known.count(False), known.count(True)
-
     def add_stored(self, poses: Poses) -> None:
         """Insert stored poses before the others, each with an orientation of its own."""
         self._earlier[:0] = dwells_of(poses)

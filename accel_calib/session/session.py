@@ -27,7 +27,7 @@ from .state import new_sensor
 from .store import SensorFiles, store_of
 from .stream import AGAIN, SILENT
 from .use import adopt, Holder, open_files, show_mounting, show_poses
-from .worker import answered, ShowPoses, Still, Task
+from .worker import answered, Still, Task
 from ..comparison import status
 from ..findings import mounting_words
 from ..logs import named_topics
@@ -127,10 +127,11 @@ class Session(Holder):
                 and 'temperature' not in topics and math.isnan(state.around.temperature)):
             self.log('warning', f'no temperature arrives; {way_of("temperature", state)}',
                      'thermometers', 10.0 * _FAULT_AGAIN)
-        for column in topics:
-            lack, have = state.sensor.live.lacking(column)
-            if lack and have:
-                self.log('info', f'{lack} of {counted(lack + have, "pose")} have no {column}, '
+        poses = state.sensor.live.poses()
+        for column in filter(poses.__contains__, topics):
+            lack = int(np.sum(np.isnan(poses[column])))
+            if 0 < lack < len(poses):
+                self.log('info', f'{lack} of {counted(len(poses), "pose")} have no {column}, '
                          'so that ~/refine cannot use it', f'poses without {column}',
                          10.0 * _FAULT_AGAIN)
 
@@ -247,16 +248,13 @@ class Session(Holder):
     # The sensor and its files
 
     def _show_frame(self) -> None:
-        """Show poses and mounting in the frames, which have changed."""
+        """Show the mounting in the frames, which have changed."""
         frame_id, settings = self.state.frame_id, self.state.settings
         if frame_id and settings.rotate and frame_id == settings.output_frame_id:
             self.log('warning', f'output_frame_id is {frame_id!r}, the frame of the sensor: TF '
                      'turns levelled messages twice; choose another output_frame_id, or set '
                      'rotate to false')
         show_mounting(self)
-        plan = self.sensor.guide.plan
-        if plan is not None:
-            self.events.append(ShowPoses(plan.up, frame_id or ''))
 
     def _begin(self, run: Callable[[Task], object]) -> bool:
         """

@@ -83,8 +83,6 @@ class Sensor:
         Number of poses of the last fit; 0 if more poses are asked for.
     auto_fit_waits : bool
         Whether poses wait for an automatic fit.
-    refusal : str
-        Why the last automatic fit was refused; empty if it was not.
     owners : set of str
         Sensors that the stored files name.
     drift : Drift or None
@@ -107,7 +105,6 @@ class Sensor:
     changes: int = 0
     fitted_poses: int = 0
     auto_fit_waits: bool = False
-    refusal: str = ''
     owners: frozenset[str] = frozenset()
     drift: Drift | None = None
     rest: Dwell | None = None
@@ -200,20 +197,14 @@ class Sensor:
     def _with(self, rest: Dwell, least: float) -> Drift | None:
         """Return the state of the monitor after what was not counted yet of a rest."""
         part = self._uncounted(rest)
-        context = None if part is None else self.known_context(part)
-        if self.past is None or self.calibration is None or part is None or context is None:
+        if self.past is None or self.calibration is None or part is None:
             return self.past
+        context, needs = self.context_of(part, self.calibration), {*self.calibration.model.needs}
+        if not needs <= context.keys() or needs.intersection(CONTEXT) - part.context.keys():
+            return self.past  # what did not arrive is assumed
         noise = part.std[np.newaxis] / math.sqrt(part.count)
         found = rest_errors(self.calibration, part.mean[np.newaxis], noise, context)
         return compared(self.past, found[0], least)
-
-    def known_context(self, rest: Dwell) -> Context | None:
-        """Return the context of a rest, or None if the calibration needs more context."""
-        if self.calibration is None:
-            return None
-        context, needs = self.context_of(rest, self.calibration), {*self.calibration.model.needs}
-        assumed = needs.intersection(CONTEXT) - rest.context.keys()
-        return context if needs <= context.keys() and not assumed else None
 
     def context_of(self, rest: Dwell, calibration: Calibration) -> Context:
         """Return the context of a rest as one row; what did not arrive is as for its messages."""

@@ -312,7 +312,7 @@ def _draw_poses(session: Holder, sensor: Sensor, poses: Poses, *, added: int,
         return ''
     if plan is not None:
         session.change_sensor(guide=session.sensor.guide.choose(plan))
-        session.events.append(ShowPoses(plan.up, session.state.frame_id or ''))
+        session.events.append(ShowPoses(plan.up))
     if new_rest is None:
         return ''
     guide, step = session.sensor.guide, next_step(session.state)

@@ -283,7 +283,6 @@ class ShowPoses(NamedTuple):
     """The poses to draw: (n, 3) directions of up in the sensor frame."""
 
     up: Floats
-    frame_id: str
 
 
 class Mounting(NamedTuple):
