@@ -8,8 +8,6 @@ Each has its options as entries, as `accel_calib.cli.options` describes them.
 
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Collection
 from functools import partial
@@ -88,7 +86,7 @@ def _words(value: object) -> list[str]:
     return [','.join(columns)] if columns else [word for each in value for word in _words(each)]
 
 
-def next_command(step: NextStep, args: argparse.Namespace) -> str:
+def next_command(step: 'NextStep', args: argparse.Namespace) -> str:
     """Return the command of the next step after a command; empty if hands are needed."""
     log = getattr(args, 'log', None) or getattr(args, 'poses', None)
     written, base = getattr(args, 'output', None), getattr(args, 'calibration', None)

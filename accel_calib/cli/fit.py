@@ -9,8 +9,6 @@ The commands that calibrate, and those from files to files.
 
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
@@ -261,7 +259,7 @@ def run_report(args: argparse.Namespace) -> Done:
     return Done(shown=lines, page=partial(refinement_page, result, str(args.poses)))
 
 
-def _refined(args: argparse.Namespace) -> tuple[Intake, Refinement]:
+def _refined(args: argparse.Namespace) -> 'tuple[Intake, Refinement]':
     """Refine with one log."""
     from ..refinement import refine  # a fit alone does not load the search
 

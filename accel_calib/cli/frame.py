@@ -19,8 +19,6 @@ terminal. Progress is shown on standard error if it is a terminal.
 
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, ExitStack
@@ -230,7 +228,7 @@ def write_json(target: str | None, result: object) -> None:
         write_atomically(Path(target), lambda file: file.write(f'{text}\n'))
 
 
-def console(args: argparse.Namespace) -> Output:
+def console(args: argparse.Namespace) -> 'Output':
     """Return the console for text output: standard error if a result goes to standard output."""
     return Output(stderr=any(target.path == _PIPED for target in _outputs(args)))
 

@@ -12,8 +12,6 @@ that they can be read from a distance. Two columns of the terminal, or half a ro
 
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -222,7 +220,7 @@ def run_watch(args: argparse.Namespace) -> Done:
 
 
 @contextmanager
-def _open_screen(bell: bool) -> Iterator[Show]:
+def _open_screen(bell: bool) -> 'Iterator[Show]':
     """Yield the function that shows the progress: on the screen, or by a line for each change."""
     console, before = Output(), ''
     last: Progress | None = None
@@ -231,7 +229,7 @@ def _open_screen(bell: bool) -> Iterator[Show]:
     if sys.stdout.isatty() and not console.is_dumb_terminal:
         terminal = Live(console=console, auto_refresh=False, screen=True)
     with terminal as live:
-        def show(node: str, progress: Progress | None, problem: str) -> None:
+        def show(node: str, progress: 'Progress | None', problem: str) -> None:
             nonlocal last, before, view
             if live is not None:
                 if bell and progress is not None and last is not None and (
@@ -252,7 +250,7 @@ def _open_screen(bell: bool) -> Iterator[Show]:
         console.print(view)  # the terminal returns to what it showed before
 
 
-def screen(node: str, progress: Progress | None, problem: str = '') -> RenderableType:
+def screen(node: str, progress: 'Progress | None', problem: str = '') -> RenderableType:
     """
     Return the screen of a calibrator by its full name; `progress` is None before any message.
 
@@ -277,7 +275,7 @@ def screen(node: str, progress: Progress | None, problem: str = '') -> Renderabl
     return Panel(Group(*parts), title=Text(node), border_style=BAD if problem else 'dim')
 
 
-def state(node: str, progress: Progress) -> Iterator[str]:
+def state(node: str, progress: 'Progress') -> Iterator[str]:
     """Yield the lines of a progress: its rows, the next step, and the call of its service."""
     for row in _rows(progress):
         yield f'{row.label}: {row.words}'
@@ -285,7 +283,7 @@ def state(node: str, progress: Progress) -> Iterator[str]:
     yield from (f'next: {advice}', *others)
 
 
-def changes(node: str, before: Progress | None, now: Progress) -> Iterator[str]:
+def changes(node: str, before: 'Progress | None', now: 'Progress') -> Iterator[str]:
     """Yield a line for each change that the user must know; all is new if `before` is None."""
     if before is None or (before.poses, before.advice) != (now.poses, now.advice):
         what = 'captured pose' if before is not None and now.poses > before.poses else 'poses:'
@@ -298,7 +296,7 @@ def changes(node: str, before: Progress | None, now: Progress) -> Iterator[str]:
         yield f'still: hold it for {now.min_dwell:g} s' if now.still else 'moving'
 
 
-def _rows(progress: Progress) -> list[_Row]:
+def _rows(progress: 'Progress') -> list[_Row]:
     now, style = progress, GOOD if progress.still else BAD
     stillness = 'no Imu messages yet'
     if not math.isnan(now.stillness):
@@ -322,7 +320,7 @@ def _rows(progress: Progress) -> list[_Row]:
             _Row('temperature', f'{now.temperature:.1f} °C')])]
 
 
-def _next_lines(node: str, progress: Progress) -> list[str]:
+def _next_lines(node: str, progress: 'Progress') -> list[str]:
     """Return the next step, its direction if that has a name, and the call of its service."""
     lines = [progress.advice or 'wait']
     if _sides(progress):
@@ -333,7 +331,7 @@ def _next_lines(node: str, progress: Progress) -> list[str]:
     return lines
 
 
-def _sides(progress: Progress) -> str:
+def _sides(progress: 'Progress') -> str:
     """Return the sides to point up, such as ``FRONT LEFT``; empty for another direction."""
     if not progress.direction:
         return ''

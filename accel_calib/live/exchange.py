@@ -15,8 +15,6 @@ no data misses progress, and is closed after `STUCK_S`; a viewer that comes back
 
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
@@ -329,7 +327,7 @@ class Viewer:
         if raw is not None:
             raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
 
-    async def run(self, admit: Callable[[Viewer, str], None]) -> None:
+    async def run(self, admit: 'Callable[[Viewer, str], None]') -> None:
         """Serve the viewer until it ends; `admit` it with its token."""
         sending: asyncio.Task[None] | None = None
         try:

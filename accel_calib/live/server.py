@@ -17,10 +17,9 @@ viewer is a connection that has become a WebSocket and said hello.
 
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections import Counter
+from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
 import errno
@@ -32,7 +31,7 @@ from pathlib import Path
 import secrets
 import socket
 from threading import Thread
-from typing import Any, cast, TYPE_CHECKING
+from typing import Any, cast
 from urllib.parse import urlsplit
 
 from aiohttp import web
@@ -45,9 +44,6 @@ from ..report import policy
 from ..session import Answer, Throttle
 from ..stored.exports import FORMATS
 from ..text import plain
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 _REQUEST_S = 10.0
 """Time within which a connection must send its request [s]."""
@@ -95,7 +91,7 @@ class Connection(web.RequestHandler):
 
     """
 
-    def __init__(self, server: PageServer, http: web.Server) -> None:
+    def __init__(self, server: 'PageServer', http: web.Server) -> None:
         super().__init__(http, loop=asyncio.get_running_loop(),
                          access_log=None)  # type: ignore[arg-type]
         self._owner, self.stage, self.address = server, 0, ''

@@ -22,8 +22,6 @@ SQLite (``-wal`` or ``-journal``). `rosbags` ignores it. SQLite joins both files
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, ExitStack
 from dataclasses import dataclass
@@ -277,14 +275,14 @@ class Bag:
     """
 
     path: Path
-    reader: Reader1 | Reader2
+    reader: 'Reader1 | Reader2'
     ros2: bool
     notes: tuple[str, ...] = ()
 
     def topics(self, msgtype: str) -> list[str]:
         return sorted({c.topic for c in self.reader.connections if c.msgtype == msgtype})
 
-    def connections(self, topic: str, msgtype: str = IMU) -> list[Connection]:
+    def connections(self, topic: str, msgtype: str = IMU) -> 'list[Connection]':
         """Return the connections of a topic; a topic can have several."""
         return [c for c in self.reader.connections if (c.topic, c.msgtype) == (topic, msgtype)]
 
@@ -299,7 +297,7 @@ class Bag:
         return sum(connection.msgcount for file in getattr(storage, 'storages', [storage])
                    for connection in file.connections)
 
-    def blocks(self, connections: Sequence[Connection] = (), size: int = BLOCK
+    def blocks(self, connections: 'Sequence[Connection]' = (), size: int = BLOCK
                ) -> Iterator[list[Received]]:
         """
         Yield blocks of messages, in order of receipt; by default those of all connections.
@@ -335,7 +333,7 @@ class Bag:
                              'record while the sensor publishes')
         return self.joined(block, topic, msgtype).frame_ids[0] if block else ''
 
-    def numbers(self, connection: Connection) -> tuple[str, ...]:
+    def numbers(self, connection: 'Connection') -> tuple[str, ...]:
         """Return the paths of the single numbers of a message, without headers and times."""
         from rosbags.interfaces import Nodetype
 
@@ -406,7 +404,7 @@ def imus_of(messages: Messages, name: str, before: int, sensor: str, *, chosen: 
 
 
 @cache
-def types_of(definition: MessageDefinition, msgtype: str, ros2: bool) -> Typestore:
+def types_of(definition: 'MessageDefinition', msgtype: str, ros2: bool) -> 'Typestore':
     """Return the types that the bag defines for a type of messages, or else the usual ones."""
     from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 

@@ -16,26 +16,22 @@ first messages of the Imu, converts this time to that of the stamps.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Container, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 from operator import attrgetter
 from pathlib import Path
 import re
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from .bag import Bag, BLOCK, imus_of, NANO, NUMBERS, open_bag, Received, TEMPERATURE, types_of
+from .columns import LogOptions
 from .names import ZEROS
 from ..errors import InputError
 from ..table import concatenated, CONTEXT, Floats, quantity_key, Recording
 from ..text import counted, listed, some
-
-if TYPE_CHECKING:
-    from .columns import LogOptions
 
 _PRESSURE = 'sensor_msgs/msg/FluidPressure'
 _OF_TYPE = {TEMPERATURE: 'temperature', 'sensor_msgs/msg/BatteryState': 'supply_voltage'}

@@ -19,8 +19,6 @@ MATLAB are refused: only MATLAB can convert all of them. No pickled object is re
 
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -408,7 +406,7 @@ class Piped(str):
 
     data: bytes
 
-    def __new__(cls, data: bytes) -> Piped:
+    def __new__(cls, data: bytes) -> 'Piped':
         made = super().__new__(cls, 'standard input')
         made.data = data
         return made

@@ -15,8 +15,6 @@ their name.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import math
@@ -312,7 +310,7 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions, *, samp
                           'alike')
 
 
-def _check_rests(columns: Chosen, rests: Rests, units: Units | None, *, stated: bool) -> None:
+def _check_rests(columns: Chosen, rests: 'Rests', units: Units | None, *, stated: bool) -> None:
     """Check that gravity is in the readings, and their unit, if the names or the maker tell it."""
     if units is not None and units.is_native:
         return
@@ -337,7 +335,7 @@ def _check_rests(columns: Chosen, rests: Rests, units: Units | None, *, stated: 
                          f'{per_g:.4g}', advice)
 
 
-def _words(columns: Chosen, rests: Rests, units: Units, factor: float, *, stated: bool) -> str:
+def _words(columns: Chosen, rests: 'Rests', units: Units, factor: float, *, stated: bool) -> str:
     words, name = compact(columns.names('reading')), units.name
     if units.is_native and not stated:
         size = rests.per_g

@@ -18,8 +18,6 @@ read, with values in JSON: ``# units: "m/s2"``, ``# sensor: "imu_link"`` and ``#
 
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -85,8 +83,8 @@ _BLANK = ' \t\r\n,;|'
 _ONE_LABEL = re.compile(r'\s*([A-Za-z]\w*)(?:\s*[:=]\s*|\s+)[-+]?\d*\.?\d+(?:\s*\D{0,6})?')
 
 
-def text_table(path: Path, options: LogOptions, raw: io.BufferedReader[Any], size: int
-               ) -> TextTable:
+def text_table(path: Path, options: LogOptions, raw: 'io.BufferedReader[Any]', size: int
+               ) -> 'TextTable':
     """Return the text table of an open file of this size [bytes]; see `find_layout`."""
     encoding = _encoding(raw.peek())
     text = io.TextIOWrapper(raw, encoding, errors='replace', newline=None)

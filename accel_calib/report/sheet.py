@@ -16,8 +16,6 @@ is drawn.
 
 """
 
-from __future__ import annotations
-
 from base64 import b64encode
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -80,7 +78,7 @@ def page(name: str, title: str, about: Iterable[str], rating: Rating, *, script:
 
 
 @cache
-def _templates() -> Environment:
+def _templates() -> 'Environment':
     """Return the templates of all pages, which escape all text."""
     # The import is here because it would slow down commands that write no page.
     from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -180,7 +178,7 @@ class Drawing:
 
     name: str
     title: str
-    figure: Figure
+    figure: 'Figure'
     hover: Mapping[str, Marks] = field(default_factory=dict)
 
 
@@ -201,7 +199,7 @@ def styled() -> Any:
 @contextmanager
 def drawn(height_inches: float, title: str = '', rows: int = 1, columns: int = 1, *,
           width_inches: float = WIDTH_INCHES, grid: str = 'both', **shared: Any
-          ) -> Iterator[tuple[Figure, Any]]:
+          ) -> 'Iterator[tuple[Figure, Any]]':
     """
     Yield a new figure and its panels, to be drawn in the style of all figures.
 
@@ -221,7 +219,7 @@ def drawn(height_inches: float, title: str = '', rows: int = 1, columns: int = 1
         yield figure, panels
 
 
-def legend_below(figure: Figure, columns: int, *entries: Any) -> None:
+def legend_below(figure: 'Figure', columns: int, *entries: Any) -> None:
     """Draw a legend below the panels; the location 'outside' needs matplotlib 3.7."""
     legend = figure.legend(*entries, loc='lower center', ncols=columns)
     rows = -(-len(legend.get_texts()) // columns)
@@ -230,7 +228,7 @@ def legend_below(figure: Figure, columns: int, *entries: Any) -> None:
     engine.set(rect=(0.0, part, 1.0, 1.0 - part))
 
 
-def add_bar(figure: Figure, scattered: Any, panels: Iterable[Any], label: str, **options: Any
+def add_bar(figure: 'Figure', scattered: Any, panels: Iterable[Any], label: str, **options: Any
             ) -> None:
     """Add a bar with the colours of scattered markers."""
     bar: Any = figure.colorbar(scattered, ax=list(panels), aspect=40, **options)

@@ -10,8 +10,6 @@ and fills the template.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 import csv
 from dataclasses import dataclass, field, replace
@@ -20,7 +18,7 @@ import io
 import json
 from pathlib import Path
 from types import MappingProxyType
-from typing import TextIO, TYPE_CHECKING
+from typing import TextIO
 
 import numpy as np
 
@@ -30,16 +28,13 @@ from .formats import (
     read_noise)
 from .made import difference_mg, Format, LEAST_LOSS_MG, Loss, losses_of, Made, Options, rendered
 from .. import __version__
-from ..calibration import Calibration
+from ..calibration import Calibration, PosePlan
 from ..disk import write_atomically
 from ..errors import InputError
 from ..findings import plan_lines
 from ..geometry import attitude_words
 from ..text import one_line
 from ..units import STANDARD_GRAVITY
-
-if TYPE_CHECKING:
-    from ..calibration import PosePlan
 
 __all__ = ['CALIBRATION_ALONE', 'FORMATS', 'Exported', 'Format', 'Loss', 'Noise', 'Options',
            'export', 'identifier', 'read_noise', 'write_plan']
