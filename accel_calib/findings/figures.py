@@ -346,10 +346,13 @@ class Expected:
     dof : int
         Number of equations of distinct poses beyond the number of free values. The errors of poses
         with known forces are vectors.
-    noise_mg : float or None
-        Noise of a pose, RMS over the poses; None if it is not known.
+    noise_mg, before_mg : float or None
+        Noise of a pose, RMS over the poses, and the error without the calibration and without
+        noise; None if it is not known.
     stated_mg, worst_mg : float
         Stated uncertainty, RMS over the sphere (partial: over the poses), and the largest one.
+    few : float
+        Factor on the uncertainty because few poses check the noise.
     hidden_mg : float
         Residual beyond the noise; without known noise, the residual.
     is_beyond_noise : bool
@@ -378,17 +381,17 @@ class Expected:
         per_dof = math.sqrt(len(self.poses) * rows / dof) if dof else 1.0  # error over residual
         floor, chi2 = quality.noise_floor_mg, quality.chi2_per_dof
         self.noise_mg = None if floor is None else floor * per_dof
+        self.before_mg = None if calibration.units.is_native else without_noise(
+            quality.rms_before_mg, self.noise_mg)
         self.stated_mg = MG * (
             rms(deviations_g(calibration, self.directions)) if self.is_partial and effects else
             stated_uncertainty(calibration) or 0.0)
         self.worst_mg = uncertainty_g(calibration) * MG if effects else 0.0
-        # The factor on the uncertainty because few poses check the noise, and the ratio of the
-        # largest scatter that their squares allow to its RMS.
-        few = scatter = 1.0
+        self.few = scatter = 1.0  # the latter: largest scatter that few squares allow, over RMS
         if dof:
             scatter = math.sqrt(dof / float(scipy.special.chdtri(dof, 1.0 - _UNLUCKY)))
         if dof and chi2 is not None:
-            few = max(math.sqrt(chi2 / variance_factor(chi2 * dof, dof, True)) * scatter, 1.0)
+            self.few = max(math.sqrt(chi2 / variance_factor(chi2 * dof, dof, True)) * scatter, 1.0)
         self.hidden_mg = 0.0
         if dof and not self.is_partial:
             if floor is None or chi2 is None:
@@ -397,7 +400,7 @@ class Expected:
                 self.hidden_mg = without_noise(quality.rms_after_mg, floor) * per_dof
         self.is_beyond_noise = self.noise_mg is not None and self.hidden_mg >= max(
             MATTERS.value, self.noise_mg * math.sqrt(HIDDEN.value ** 2 - 1.0))
-        self.inexact_mg = math.hypot(BOUND * self.stated_mg * few, self.omitted_mg)
+        self.inexact_mg = math.hypot(BOUND * self.stated_mg * self.few, self.omitted_mg)
         self.error_mg = math.hypot(
             self.inexact_mg, self.hidden_mg * (1.0 if self.noise_mg is None else scatter),
             *(size for _, size in self.not_corrected))

@@ -78,15 +78,14 @@ def _find_failures(expected: Expected, refinement: Refinement | None) -> Iterato
             and expected.effects == refinement.calibration.model.effects):
         message, advice = refinement.refusal
         yield Finding('refused', message, advice, 'BAD')
-    own, before = expected.own_mg, without_noise(
-        expected.quality.rms_before_mg, expected.noise_mg)
+    own, before, is_partial = expected.own_mg, expected.before_mg, expected.is_partial
     if expected.noise_mg is None and expected.dof < TO_CHECK.value:
         return  # the uncertainty is hardly known
     if own > BAD_ERROR.value:
         yield Finding('error', f'the error in new orientations is {mg(own)}, expected at most '
                       f'{mg(BAD_ERROR.value)}', level='BAD', **_remedy(expected, refinement))
-    elif (expected.effects and not expected.is_partial and own > max(before, MATTERS.value)
-          and not expected.calibration.units.is_native):  # their error before is not known
+    elif (expected.effects and not is_partial and before is not None
+          and own > max(before, MATTERS.value)):
         yield Finding('no_gain', f'the error in new orientations is {mg(own)}, and {mg(before)} '
                       'without the calibration', level='BAD' if own > WORST_ERROR.value else
                       'USABLE', **_remedy(expected, refinement))
