@@ -351,7 +351,6 @@ def key_of(content: str, found: Input, options: Options) -> str:
     except AccelCalibError as err:
         place = str(err)
     stated = asdict(replace(options, own=()))
-    del stated['own']
     own = dict.fromkeys(each.source[1].hex() for each in options.own if each.source)
     about = json.dumps([content, place, __version__, RESULTS, stated, *own], default=str,
                        sort_keys=True)
@@ -379,9 +378,8 @@ def row_of(found: Input, path: Path, options: Options) -> tuple[Row, Calibration
 
 def unread_row(found: Input, options: Options, error: AccelCalibError) -> Row:
     """Return the row of a recording that could not be read."""
-    if (written := as_text(found.path)) != found.path:
-        found = Input(written, '')
-    return _about(found, options, None, None) | {
+    written = Input(as_text(found.path), as_text(found.inside))
+    return _about(written, options, None, None) | {
         'status': 'unread', 'error': error.message, 'advice': error.advice}
 
 

@@ -121,17 +121,16 @@ class Store:
 
         """
         folder, data = self.folder / 'pending' / name, self.data(name)
-        paths = sorted(folder.glob('*.json'), key=lambda path: path.stat().st_mtime)
-        new = [_pending_row(path) for path in paths]
+        new = [_pending_row(path) for path in sorted(
+            folder.glob('*.json'), key=lambda path: path.stat().st_mtime)]
         if not new:
             return
-        content = {row['recording']: row['content'] for row in new}
+        contents = {row['recording']: row['content'] for row in new}
         old, added = read_parquet(data), [row for row in new if as_folder(row['sensor']) == name]
         newest = {row['content']: row for row in added}
-        rows = [row for row in old if row['content'] not in newest and (
-            row['recording'] not in content
-            or (row['status'] == 'ok' and row['content'] != content[row['recording']]))]
-        rows += newest.values()
+        rows = [*newest.values(), *(row for row in old if row['content'] not in newest and (
+            row['recording'] not in contents
+            or (row['status'] == 'ok' and row['content'] != contents[row['recording']])))]
         if rows:
             write_parquet(data, sorted(rows, key=lambda row: (
                 row['date'] or '', row['recording'])), schema())

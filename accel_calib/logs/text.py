@@ -297,7 +297,7 @@ def _about(path: Path, head: Sequence[str]) -> dict[str, Any]:
             text = text.strip()
             with suppress(TypeError, ValueError):  # an ordinary comment
                 bare = text in UNIT_NAMES or ('sensor' in name and text[:1] != '"')
-                value = text if bare else read_json(text)
+                value: Any = text if bare else read_json(text)
                 about[name.strip()] = Autopilot(**value) if 'autopilot' in name else (
                     '' if value is None else str(value))
     if about.get('units', '') not in ('', *UNIT_NAMES):
