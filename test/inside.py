@@ -51,8 +51,10 @@ from accel_calib.fleet.run import mapped
 from accel_calib.fleet.sensors import alike, drift_of, merge_sensor, write_parquet
 from accel_calib.geometry import (
     distinct, OVER_THE_SPHERE, quaternion_of, rotation_from_rpy, spread_directions, unit, words_of)
-from accel_calib.logs import bag_samples, child, layout_with, LogOptions, open_bag, open_log, text
+from accel_calib.logs import (
+    bag_samples, child, is_port, layout_with, LogOptions, open_bag, open_log, port, text)
 from accel_calib.logs.names import meaning
+from accel_calib.logs.port import _interval as interval_of_lines
 from accel_calib.logs.quantities import are_samples
 from accel_calib.noise.allan import (
     allan_variances, COMPONENTS as ALLAN_COMPONENTS, fit_components, octaves, shares, spread_of)
@@ -160,6 +162,9 @@ BLOCK_OF_A_BAG = bag_samples, 'BLOCK'
 MOST_VALUES_READ = plain_yaml, 'MOST_VALUES'
 MOST_BYTES_READ = plain_yaml, 'MOST_BYTES'
 MOST_LETTERS_OF_LABELS = calibration_yaml, '_MOST_LETTERS'
+HEAD_OF_A_PORT = port, '_HEAD_S'
+MOST_OF_A_HEAD = port, '_HEAD_CHARACTERS'
+PATIENCE_OF_A_PORT = port, '_PATIENCE_S'
 PATIENCE_OF_A_WORKER = worker, '_PATIENCE'
 LARGEST_SAMPLE = refine_search, 'MOST'
 LARGEST_NUMBER_OF_STEPS = session_store, 'MOST_STEPS'
@@ -170,14 +175,10 @@ if find_spec('aiohttp'):  # what the live page needs is not installed everywhere
     from accel_calib.live.exchange import (
         announce, BUTTONS, LARGEST as LARGEST_LIVE_MESSAGE, PERIOD as LIVE_PERIOD, qr_code,
         reachable)
-    from accel_calib.live.host import (
-        _interval as interval_of_lines, Host, is_port, open_source, Source)
+    from accel_calib.live.host import Host, open_source, Source
     from accel_calib.live.server import PageServer
 
     CLOCK_OF_A_SOURCE = host, 'time'
-    HEAD_OF_A_PORT = host, '_HEAD_S'
-    MOST_OF_A_HEAD = host, '_HEAD_CHARACTERS'
-    PATIENCE_OF_A_PORT = host, '_PATIENCE_S'
     PATIENCE_FOR_A_HELLO = exchange, '_HELLO_S'
     PATIENCE_FOR_A_REQUEST = server, '_REQUEST_S'
     PERIOD_OF_A_COMPLAINT = server, '_QUIET_S'

@@ -8,31 +8,25 @@ A source yields blocks of samples without waiting for long: a block can be empty
 of the host does all that changes the session: it takes samples, runs commands, and finishes jobs.
 After the end of the source, the page and its commands continue to work.
 
-**Ports.** The first lines of a serial port are collected, because dialect, columns and units are
-recognised from several ones, and the interval from their times. A port that is removed is opened
-again when it returns.
-
 """
 
-from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import chain
-import math
 from pathlib import Path
 from queue import Empty, SimpleQueue
 import re
 import time
 from time import monotonic
-from typing import Any
 
 import numpy as np
 
 from .exchange import Exchange, PERIOD
 from .server import PAGE, PageServer
-from ..errors import AccelCalibError, InputError, known_error, needing
+from ..errors import AccelCalibError, InputError, known_error
 from ..finding import Finding
-from ..logs import LineReader, LogOptions, open_log
+from ..logs import is_port, LineReader, LogOptions, open_log, open_port
 from ..session import (
     BATCH, CalibratorSettings, Event, Log, Session, Severity, Surroundings, Throttle, Worker)
 from ..stillness import samples_of
@@ -43,29 +37,10 @@ _TICK = 1.0
 """Interval between two checks of the stream [s]."""
 
 _WAIT_S = 0.03
-"""Interval between two blocks of a recording, and longest wait for a line of a port [s]."""
+"""Interval between two blocks of a recording [s]."""
 
 _LONGEST_GAP_S = 5.0
 """Longer gaps in a recording are not waited for [s]."""
-
-_HEAD_S = 2.0
-"""Time over which the first lines of a port are collected [s]."""
-
-_HEAD_LINES, _HEAD_CHARACTERS = 20, 1 << 18
-"""Fewest first lines, and number of characters after which no more are collected: each takes some
-150 bytes while the lines are recognised."""
-
-_PATIENCE_S = 10.0
-"""Time without a line that is understood after which a port is refused [s]."""
-
-_LONGEST_LINE = 4096
-"""Longest line of a port [bytes]."""
-
-_AGAIN_S = 1.0
-"""Interval between two attempts to open a port that was removed [s]."""
-
-_RETURN = ('connect the sensor again; the page continues when it is back, and the poses are '
-           'kept')
 
 
 @dataclass(frozen=True)
@@ -234,13 +209,12 @@ def open_source(name: str, options: LogOptions, *, baud: int, speed: float = 1.0
 
     """
     if is_port(name):
-        port = _Port()
-        with closing(port.lines(name, baud)) as arriving:
-            reader = _understood(name, arriving, options, baud)
+        with open_port(name, options, baud) as (reader, arriving, problem):
+            first = [] if reader.first is None else [_rows(reader.first)]
             blocks = (rows for lines in arriving for rows in _rows_of(reader, lines))
             yield Source(name, sensor='', units=reader.units, read_as=reader.read_as,
-                         blocks=_in_order(chain([_rows(reader.first)], blocks)),
-                         findings=reader.findings, problem=lambda: port.problem)
+                         blocks=_in_order(chain(first, blocks)), findings=reader.findings,
+                         problem=problem)
         return
     with open_log(Path(name), options) as log:
         yield Source(name, log.sensor, log.units, log.read_as,
@@ -276,108 +250,6 @@ def _rows(recording: Recording) -> Floats:
 
 
 # ----------------------------------------------------------------------------- a serial port
-
-def is_port(name: str) -> bool:
-    """Return whether a name is that of a serial port, and not of a recording."""
-    return '://' in name or name.upper().startswith(('COM', '/DEV/')) or (
-        Path(name).is_char_device())
-
-
-class _Port:
-    """A serial port; `problem` is why it sends nothing at present, empty if it is open."""
-
-    problem = ''
-
-    def lines(self, name: str, baud: int) -> Generator[list[str], None, None]:
-        """
-        Yield complete lines, or none after a moment; the first one, maybe cut, is left out.
-
-        The port is opened again when it returns after it was removed. InputError if it cannot be
-        opened at the start.
-
-        """
-        with needing('pyserial', 'a serial port'):
-            import serial
-        port: Any = None
-        rest, is_cut, tried = b'', True, -math.inf
-        try:
-            while True:
-                found = b''
-                if port is None and time.monotonic() - tried >= _AGAIN_S:
-                    is_first, tried = tried < 0.0, time.monotonic()
-                    try:
-                        port = serial.serial_for_url(name, baudrate=baud, timeout=_WAIT_S)
-                        self.problem = ''
-                    except (OSError, ValueError) as err:  # SerialException is an OSError
-                        problem = InputError(
-                            f'{name} cannot be opened: {err}', 'check its name, whether another '
-                            'program uses it, and your rights (on Linux: group dialout)')
-                        if is_first:
-                            raise problem from err
-                        self.problem = f'{problem.message}: {_RETURN}'
-                if port is None:
-                    time.sleep(_WAIT_S)
-                else:
-                    try:
-                        found = port.read(port.in_waiting or 1)
-                    except OSError as err:
-                        port.close()
-                        port, rest, is_cut = None, b'', True
-                        self.problem = f'{name} does not send any more ({err}): {_RETURN}'
-                *lines, rest = (rest + found).split(b'\n')
-                rest = rest[-_LONGEST_LINE:]
-                if lines and is_cut:
-                    lines, is_cut = lines[1:], False
-                yield [line[:_LONGEST_LINE].decode('utf-8', errors='replace').rstrip('\r')
-                       for line in lines]
-        finally:
-            if port is not None:
-                port.close()
-
-
-def _understood(name: str, lines: Iterator[list[str]], options: LogOptions, baud: int
-                ) -> LineReader:
-    """Return the reader of the lines, as soon as the first ones are understood."""
-    head: list[str] = []
-    count = size = 0
-    arrived: list[tuple[int, float]] = []
-    begin = tried = time.monotonic()
-    problem = InputError(f'{name} sends no lines, expected one line for each sample',
-                         'check the sensor and its program')
-    for new in lines:
-        now = time.monotonic()
-        if new and not head:
-            begin = tried = now
-        if new:
-            head += new if size < _HEAD_CHARACTERS else []
-            count, size = count + len(new), size + sum(map(len, new))
-            arrived.append((count, now))
-        if now - tried >= _HEAD_S and len(head) >= _HEAD_LINES and (
-                arrived[-1][1] - arrived[0][1] > _WAIT_S):
-            tried = now
-            try:
-                return LineReader(name, head, _interval(arrived), options)
-            except InputError as err:
-                problem = err
-        if now - begin > _PATIENCE_S:
-            break
-    raise InputError(problem.message, f'{problem.advice}; check the baud rate {baud}, too '
-                     '(--baud)')
-
-
-def _interval(arrived: list[tuple[int, float]]) -> float:
-    """
-    Return the time from line to line [s], from the number of lines at times [s].
-
-    It is the median of the slopes between times half of the list apart (Theil 1950), which neither
-    a backlog at the start nor lines that are late at the end change much. Of the times within
-    each `_WAIT_S` the last one counts, because a backlog can take many short reads.
-
-    """
-    count, seconds = np.array([*{int(at / _WAIT_S): (n, at) for n, at in arrived}.values()]).T
-    half = len(count) // 2
-    return float(np.median((seconds[half:] - seconds[:-half]) / (count[half:] - count[:-half])))
-
 
 def _in_order(blocks: Iterable[Floats]) -> Iterator[Floats]:
     """

@@ -22,6 +22,7 @@ from .containers import Frame, Piped
 from .formats import (
     BAG, FORMATS, is_bag, open_log, OpenLog, Progress, read_poses, read_recording, SUFFIXES)
 from .names import NAMES
+from .port import is_port, open_port
 from .quantities import are_samples
 from .text import LineReader, write_blocks, write_table
 
@@ -30,6 +31,7 @@ __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
            'IMU_DOUBLES', 'LITTLE_ENDIAN', 'NAMES', 'NAME_AT', 'NINE', 'ORIENTATION',
            'ORIENTATION_COVARIANCE', 'PER_MILLION', 'STAMP', 'STAMP_AT', 'SUFFIXES', 'THREE',
            'ByAxis', 'Frame', 'Layout', 'LineReader', 'LogOptions', 'OpenLog', 'Piped', 'Progress',
-           'are_samples', 'field_of', 'imus_of', 'is_bag', 'joined', 'layout_of', 'layout_with',
-           'messages_of', 'named_topics', 'open_bag', 'open_log', 'parts_of', 'read_poses',
-           'read_recording', 'topic_and_field', 'write_blocks', 'write_table']
+           'are_samples', 'field_of', 'imus_of', 'is_bag', 'is_port', 'joined', 'layout_of',
+           'layout_with', 'messages_of', 'named_topics', 'open_bag', 'open_log', 'open_port',
+           'parts_of', 'read_poses', 'read_recording', 'topic_and_field', 'write_blocks',
+           'write_table']
