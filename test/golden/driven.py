@@ -76,8 +76,9 @@ class _Driver(Driver):
 
     def frame(self) -> Any:
         """Return the rotation that is applied to messages, and the gravity in them."""
-        return {'rotation': self.session.state.applied.rotation,
-                'gravity': self.session.state.gravity / G}
+        state = self.session.state
+        return {'rotation': state.on_topics(self.calibration).rotation,
+                'gravity': state.gravity / G}
 
     def state(self) -> Any:
         """Return progress, diagnostics, checks and poses."""
