@@ -251,7 +251,7 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
         head = next(blocks)
         check_units(head, quantities.units, str(path))
         if 'time' in head and are_samples(head.columns):
-            check_order(head['time'], str(path))
+            check_order(head['time'], head.reading, str(path))
             samples = (Recording(**vars(block)) for block in chain((head,), blocks))
             count = len(head)
             if text.more:  # the size of the file, and the rows of this block, tell about how many
@@ -264,8 +264,9 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
                 for key in (*CONTEXT, *rows.quantities) if key in rows}
             lacking = [key for key, empty in holes.items() if len(empty)]
             quantities.findings += [
-                Finding('columns', f'not used, because {len(holes[key])} of {len(rows)} cells are '
-                        f'not numbers: {key}', 'fill in these cells, or remove their rows',
+                Finding('not_used', f'{key} is not used, because of cells without a number '
+                        f'({len(holes[key])} of {len(rows)})', f'fill in the cells of {key} that '
+                        'have no number, or remove their rows',
                         rows=tuple(rows.row[holes[key]].tolist())) for key in lacking]
             if 'time' not in rows and are_samples(rows.columns):
                 raise InputError(
