@@ -297,6 +297,22 @@ def test_shared_orientation_shows_temperature_across_gravity():
     np.testing.assert_allclose(values, [5e-4, 4e-4, -4e-4, 0.0, 0.0], atol=3e-5)  # without lag
 
 
+def test_a_row_with_the_number_of_another_orientation_is_left_out_for_its_vector():
+    rng, shared = np.random.default_rng(8), np.repeat(np.arange(8.0), 4)
+    poses = simulate_poses(sensor(rng), spread_directions(8)[shared.astype(int)], rng, context={
+        'orientation': np.where(np.arange(32) == 5, 6.0, shared)})
+    found = {each.row: each.reason for each in refine(poses, G).calibration.rejected}
+    away = re.search(r'the force differs by (\d+)\.', found[6])
+    assert float(away[1]) > 100.0
+
+
+def test_a_standard_deviation_that_is_too_small_is_no_drift(taken):
+    for seed in range(6):
+        poses, _ = taken(seed, poses=24)
+        found = refine(poses.with_columns(std=0.03 * poses['std']), MPS2)
+        assert found.verdict != 'drifts'
+
+
 @pytest.mark.parametrize('seed', range(3))
 def test_rows_that_are_copies_are_no_further_evidence(seed, taken):
     poses, _ = taken(seed, {'offset_temperature': 5.0}, poses=30)
