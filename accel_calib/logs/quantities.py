@@ -297,7 +297,7 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions, *, samp
     for key in {'std', 'reference'} & columns.sources.keys():  # in their own unit, if it is stated
         unit, scale = unit_of('reading', columns.sources[key][0].unit) or (name, factor)
         if not made.units.is_native:
-            scale *= made.units.per_g / units_of(unit, options.gravity).per_g
+            scale *= made.units.per_g / units_of(cast(UnitName, unit), options.gravity).per_g
         made.scales[key] = scale, 0.0
     is_ours = columns.names('reading') == [*READING] and (stated or made.units.is_si)
     if made.said or not is_ours:
