@@ -67,6 +67,7 @@ KINDS: Mapping[str, str] = MappingProxyType({
     'signs': 'numbers of the log lost their sign',
     'clock': 'the order or the times of the rows are not those of the samples',
     'columns': 'what columns hold is decided by their values',
+    'not_used': 'a column is not used, because of its cells or its values',
     'copies': 'equal rows count as one pose',
     'unlike_fleet': 'the sensor is unlike the fleet',
     'unnamed': 'recordings of a fleet do not say of which sensor they are',

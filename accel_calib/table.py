@@ -386,7 +386,7 @@ def numbered(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
 def check_values(columns: Mapping[str, NDArray[Any]], source: str, *, partial: bool = False
                  ) -> None:
     """
-    Check values; InputError if not finite or beyond any sensor, a count <= 0 or an sd < 0.
+    Check values; InputError if one is not finite, or none that its column can hold.
 
     `partial`: those of `CONTEXT` can be NaN.
 
@@ -407,6 +407,10 @@ def check_values(columns: Mapping[str, NDArray[Any]], source: str, *, partial: b
     if 'count' in columns and not np.all(columns['count'] > 0):
         raise InputError(f'{source}: column count holds numbers that are not above 0, expected '
                          'positive numbers', 'enter the number of samples of each pose')
+    if 'orientation' in columns and np.any(columns['orientation'] % 1.0):
+        raise InputError(f'{source}: column orientation holds fractions, expected whole numbers: '
+                         'rows with the same number have the same orientation', 'number the '
+                         'orientations, or leave out the column: --columns orientation=')
     for key in ('std', 'rate_std'):
         if key in columns and not np.all(columns[key] >= 0):
             one, two, three = COLUMNS[key].names

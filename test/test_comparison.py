@@ -9,9 +9,11 @@ from typing import Any
 from accel_calib.calibration import Calibration, fit_poses
 from accel_calib.comparison import compare, compared, Drift, rest_errors, status
 from accel_calib.effects import effect_named
+from accel_calib.errors import InputError
 from accel_calib.estimate import estimate
 from accel_calib.logs import read_recording
 from accel_calib.stillness import capture
+from accel_calib.stored import OF_FILE
 from accel_calib.table import Floats, Poses
 from accel_calib.units import units_of
 from inside import DRIFT_MEMORY, model_with, predict, simulate_poses, spread_directions, unit
@@ -44,6 +46,17 @@ def test_runs_of_one_sensor_agree_also_with_models_of_other_axes(models, sets, m
         alarms += not found.agree
         assert found.dof == 9 * (len(models) - 1)
     assert alarms <= 0.1 * sets
+
+
+def test_what_limits_a_comparison_is_said():
+    rng = np.random.default_rng(0)
+    first, second = runs_of(sensor(rng), rng, 2)
+    edited = replace(second, noted=(*second.noted, OF_FILE['edited']))
+    assert 'the file of run 2 was edited by hand since it was stored' in compare(
+        [first, edited]).notes
+    alone = replace(first, name='ideal', method='prior')
+    with pytest.raises(InputError, match='run 2 is an offset over temperature alone'):
+        compare([first, alone])
 
 
 def scattering_runs(seed, count, differs):

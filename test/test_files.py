@@ -41,6 +41,7 @@ def every_column(count=4):
     columns = {key: rng.uniform(1, 2, count if len(column.names) == 1 else (count, 3))
                for key, column in COLUMNS.items() if not column.made}
     columns['reference'] /= np.linalg.norm(columns['reference'], axis=1, keepdims=True)
+    columns['orientation'] = np.arange(float(count))
     columns['label'] = np.array(['flat', 'left, side up', 'nose "down"', ''])
     columns['time'] = 1.7e9 + np.arange(count) * 0.0025
     return Poses(columns, numbered(columns))
@@ -265,6 +266,13 @@ def test_other_line_ends_do_not_count_as_damage(ending: str, tmp_path: Path) -> 
     path = tmp_path / 'c.yaml'
     path.write_bytes(intact()[-1].replace('\n', ending).encode())
     assert not has(read_calibration(path).noted, 'edited')
+
+
+def test_a_mark_of_the_encoding_and_comments_can_be_before_the_first_line(tmp_path: Path) -> None:
+    path, text = tmp_path / 'c.yaml', intact()[-1]
+    for before, is_edited in (('\ufeff', False), ('# left IMU\n\n', True), ('---\n', True)):
+        path.write_text(f'{before}{text}', encoding='utf-8')
+        assert has(read_calibration(path).noted, 'edited') is is_edited
 
 
 # What a changed file may not hide

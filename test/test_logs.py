@@ -17,21 +17,40 @@ import zipfile
 from accel_calib.calibration import fit_poses, level_by_rows
 from accel_calib.errors import InputError
 from accel_calib.fleet import recordings
-from accel_calib.logs import FORMATS, LogOptions, open_log, SUFFIXES
+from accel_calib.logs import FORMATS, LogOptions, open_log, read_poses, SUFFIXES
 from accel_calib.stillness import capture
 from accel_calib.table import Recording
 from data.logs import make
-from inside import read_log, spread_directions
+from inside import model_with, read_log, simulate_recording, spread_directions
 import numpy as np
 import pytest
-from shared import data, little_memory, LOG_CORPUS, LOGS, options_of, run_json
+from shared import data, GRAVITY as G, little_memory, LOG_CORPUS, LOGS, options_of, run_json
+
+
+def samples(poses: int) -> Recording:
+    """Return a recording of some poses [m/s²]."""
+    found = simulate_recording(model_with({'offset': [0.03, -0.02, 0.05]}),
+                               spread_directions(poses), np.random.default_rng(1), noise_g=0.002)
+    return found.with_columns(reading=G * found.reading)
+
+
+def rows_of(*columns: np.ndarray, digits: str = '.9g') -> list[list[str]]:
+    """Return the cells of rows, from columns of numbers."""
+    parts = [[[format(value, digits) for value in row]
+              for row in np.reshape(column, (len(column), -1)).tolist()] for column in columns]
+    return [[cell for part in row for cell in part] for row in zip(*parts, strict=True)]
+
+
+def text_of(rows: list[list[str]], header: str) -> str:
+    return '\n'.join([header, *map(','.join, rows)]) + '\n'
+
 
 WITHIN_SD = 5.0
 
 
-def write(folder: Path, text: str) -> Path:
-    (folder / 'log.csv').write_text(text, encoding='utf-8')
-    return folder / 'log.csv'
+def write(folder: Path, text: str, name: str = 'log.csv') -> Path:
+    (folder / name).write_text(text, encoding='utf-8')
+    return folder / name
 
 
 def test_a_cut_last_line_is_left_out_and_noted_also_alone_in_its_block(tmp_path: Path) -> None:
@@ -159,6 +178,51 @@ def test_logs_of_others_become_poses(name: str, poses: int, tmp_path: Path,
     path = data(f'logs/{name}')
     _, made = run_json(capsys, 'capture', path, '-o', tmp_path / 'poses.csv')
     assert made['poses'] == poses
+
+
+@pytest.mark.parametrize('column', ['temperature', 'supply_voltage', 'humidity'])
+def test_a_column_with_holes_is_the_next_step_where_no_effect_explains(column, tmp_path, capsys):
+    rng = np.random.default_rng(6)
+    other, mean = rng.uniform(-1.0, 1.0, 24), G * spread_directions(24)[rng.permutation(24)]
+    mean = mean + 0.2 * np.outer(other, [1.0, -1.0, 0.5]) + 0.003 * rng.normal(size=(24, 3))
+    rows = rows_of(mean, 20.0 + other, np.full((24, 3), 0.03), np.full(24, 100))
+    rows[7][3] = ''
+    path = write(tmp_path, text_of(rows, f'ax,ay,az,{column},std_x,std_y,std_z,count'))
+    _, made = run_json(capsys, 'refine', path)
+    assert made['next']['text'].startswith(f'fill in the cells of {column}')
+
+
+@pytest.mark.parametrize(('number', 'apart'), [(2, 3e-3), (2, 0.0), (3, 1e-3)])
+def test_rows_of_sensors_that_alternate_are_not_one_sensor(tmp_path, number, apart):
+    made, rng = samples(3), np.random.default_rng(7)
+    turned = [made.reading @ np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(number)]
+    time = made['time'][:, np.newaxis] + apart * np.arange(number)
+    rows = rows_of(time.ravel(), np.stack(turned, axis=1).reshape(-1, 3))
+    with pytest.raises(InputError, match=f'rows of {number} sensors alternate'):
+        read_log(write(tmp_path, text_of(rows, 'time,ax,ay,az')))
+
+
+@pytest.mark.parametrize(('header', 'per_g', 'per_std'), [
+    ('ax,ay,az,std_x,std_y,std_z', 1000.0, 1000.0), ('accX,accY,accZ,std_x,std_y,std_z', G, G),
+    ('ax [mg],ay [mg],az [mg],std_x [m/s²],std_y [m/s²],std_z [m/s²]', 1000.0, G)])
+def test_a_pose_table_has_its_noise_and_times_with_readings_of_any_name_and_unit(
+        tmp_path, header, per_g, per_std):
+    up = spread_directions(24)
+    rows = rows_of(8.0 * np.arange(24), per_g * up, per_std * np.full((24, 3), 0.003))
+    poses = read_poses(write(tmp_path, text_of(rows, f'time,{header}')))
+    one_g = {'g': 1.0, 'm/s2': G}[poses.units]
+    np.testing.assert_allclose(poses['std'], 0.003 * one_g, rtol=1e-3)
+    for name in ('accX,accY,accZ', 'ax,ay,az'):
+        for scale in (1.0, 1e3):
+            rows = rows_of(scale * 8.0 * np.arange(24), G * up)
+            poses = read_poses(write(tmp_path, text_of(rows, f'time,{name}'), 'poses.csv'))
+            np.testing.assert_allclose(np.diff(poses['time']), 8.0, rtol=1e-6)
+
+
+def test_an_orientation_is_a_whole_number(tmp_path):
+    rows = rows_of(G * spread_directions(12), np.linspace(0.0, 330.5, 12))
+    with pytest.raises(InputError, match='orientation holds fractions'):
+        read_poses(write(tmp_path, text_of(rows, 'ax,ay,az,orientation')))
 
 
 # Samples of the makers' layouts

@@ -3,6 +3,7 @@
 
 """Hidden effects are named and no others, on data of an independent generator."""
 
+import re
 
 import accel_calib as ac
 from accel_calib.effects import between_steps
@@ -262,6 +263,22 @@ def test_shared_orientation_shows_temperature_across_gravity():
     assert names(found) == ['offset_temperature']
     values = found.calibration.model.values['offset_temperature']
     np.testing.assert_allclose(values, [5e-4, 4e-4, -4e-4, 0.0, 0.0], atol=3e-5)  # without lag
+
+
+def test_a_row_with_the_number_of_another_orientation_is_left_out_for_its_vector():
+    rng, shared = np.random.default_rng(8), np.repeat(np.arange(8.0), 4)
+    poses = simulate_poses(sensor(rng), spread_directions(8)[shared.astype(int)], rng, context={
+        'orientation': np.where(np.arange(32) == 5, 6.0, shared)})
+    found = {each.row: each.reason for each in refine(poses, G).calibration.rejected}
+    away = re.search(r'the force differs by (\d+)\.', found[6])
+    assert float(away[1]) > 100.0
+
+
+def test_a_standard_deviation_that_is_too_small_is_no_drift(taken):
+    for seed in range(6):
+        poses, _ = taken(seed, poses=24)
+        found = refine(poses.with_columns(std=0.03 * poses['std']), MPS2)
+        assert found.verdict != 'drifts'
 
 
 def test_a_long_table_is_refined_from_a_sample_and_says_so(monkeypatch):

@@ -21,7 +21,7 @@ from inside import (
 import numpy as np
 import pandas as pd
 import pytest
-from shared import changed, data, G, random_directions, run, sensor
+from shared import changed, data, G, random_directions, run, run_json, sensor
 
 OFFSET = np.array([0.02, -0.01, 0.03])
 WARM = np.array([6e-4, -4e-4, 5e-4])
@@ -208,6 +208,8 @@ def test_a_file_that_was_edited_is_compared_with_its_own_poses(stored, tmp_path,
     assert result['gap_mg'] > 20.0
     assert [step['effect'] for step in result['steps']] == ['offset']
     assert result['steps'][0]['parameters']['x'] == pytest.approx(-0.05, abs=2e-3)
+    _, verified = run_json(capsys, 'verify', table, '-c', path, '--units', 'g')
+    assert 'edited' in [each['kind'] for each in verified['findings']]
 
 
 @pytest.mark.parametrize('seed', [3, 10, 11, 22])

@@ -238,8 +238,8 @@ def fit_unknown(poses: Poses, units: Units, model: str, method: Method
         noted += find_undetermined(list(dilutions)[-1], used, noise)
     return record_of(
         fit, poses, units, used, name=name, method=method, covariance=covariance_with(fit, unlike),
-        rejected=rejected_by(fit.model, poses_g.take(~np.isin(original, kept))), reason=reason,
-        noted=tuple(noted)), fit
+        rejected=tuple(rejected_by(fit.model, poses_g.take(~np.isin(original, kept)))),
+        reason=reason, noted=tuple(noted)), fit
 
 
 def copies(original: Indices, poses: Poses) -> Iterator[Finding]:
@@ -323,15 +323,20 @@ def _choose(fits: Mapping[str, Fit]) -> tuple[str, str]:
     return chosen, '; '.join(reasons) or f'the poses determine only model {chosen}'
 
 
-def rejected_by(model: Model, poses_g: Poses) -> tuple[Rejected, ...]:
-    """Return outliers with their distance from 1 g under a model."""
-    if not len(poses_g):
-        return ()
+def rejected_by(model: Model, poses_g: Poses, out: Indices | None = None
+                ) -> Iterator[Rejected]:
+    """Yield outliers with what differs under a model: the indices `out` of poses, or all."""
     force = model.at(poses_g.columns).force(poses_g.reading)  # NaN far outside of its effects
-    away = np.linalg.norm(force, axis=1) - 1.0
-    return tuple(Rejected(int(row), f'outlier: |force| differs by {error * MG:+.2f} mg from 1 g '
-                          'in the fit of the others', 'outlier')
-                 for row, error in zip(poses_g.row, away, strict=True))
+    for k in range(len(poses_g)) if out is None else out:
+        words = (f'|force| differs by {(np.linalg.norm(force[k]) - 1.0) * MG:+.2f} mg from 1 g in '
+                 'the fit of the others')
+        if out is not None and 'orientation' in poses_g:
+            alike = poses_g['orientation'] == poses_g['orientation'][k]
+            alike[k] = False
+            if np.any(alike):
+                away = np.linalg.norm(force[k] - np.median(force[alike], axis=0)) * MG
+                words = f'the force differs by {away:.2f} mg from the others of its orientation'
+        yield Rejected(int(poses_g.row[k]), f'outlier: {words}', 'outlier')
 
 
 def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:

@@ -28,7 +28,6 @@ from ..report import calibration_page
 from ..report.stability import (
     comparison_page, figure_rows, history_page, kalibr_lines, need_lines, noise_page,
     parameter_rows)
-from ..stored import read_calibration
 from ..table import check_units, Recording
 from ..text import counted, plain, short
 from ..units import units_of
@@ -81,7 +80,7 @@ def several_verify(results: Sequence[dict[str, Any]]) -> Iterator[Any]:
 def run_compare(args: argparse.Namespace) -> Done:
     """Test whether calibrations agree."""
     paths = args.calibrations
-    calibrations = [read_calibration(path, args.own) for path in paths]
+    calibrations = [stored_calibration(path, args.own) for path in paths]
     comparison = compare(calibrations)
     rating = rate_comparison(comparison)
     models = [calibration.name for calibration in calibrations]
@@ -107,7 +106,7 @@ def run_compare(args: argparse.Namespace) -> Done:
 
 def run_history(args: argparse.Namespace) -> Done:
     """Sort calibrations by date, and compare them; in JSON, runs are numbered from 1."""
-    calibrations = [read_calibration(path, args.own) for path in args.calibrations]
+    calibrations = [stored_calibration(path, args.own) for path in args.calibrations]
     history, rows, lines, changes = history_of(calibrations), [], list[str](), []
     paths, labels = args.calibrations, history.labels
     found = {each.name: each for each in history.parameters}

@@ -40,7 +40,7 @@ from rich.text import Text
 from .commands import COMMANDS, next_command
 from .options import BAD_INPUT, plain_character, plain_handler, STANDARD_INPUT
 from ..calibration import Calibration
-from ..disk import replaceable, STANDARD_OUTPUT, write_atomically
+from ..disk import BEFORE, replaceable, STANDARD_OUTPUT, write_atomically
 from ..effects import effects_of_file, OwnEffect
 from ..errors import AccelCalibError, InputError, known_error, RefusedFitError, saying
 from ..findings import Rating, rating_json
@@ -61,7 +61,7 @@ _WITH_PAGE = ('calibrate', 'thermal')
 """Commands that write a page beside the calibration."""
 
 _SUFFIXES = {'calibration': '.yaml', 'page': '.html', 'table': '.csv'}
-_KINDS = {'calibration': rb'format: accel_calib', 'page': rb'<!DOCTYPE html',
+_KINDS = {'calibration': BEFORE + rb'format: accel_calib', 'page': rb'<!DOCTYPE html',
           'result': rb'\s*[{\[]', 'table': rb'(#[^\n]*\n)*[^\n]*\bax\b[^\n]*',
           'export': rb'(?s).*(written by accel-calib|accel_calib) export'}
 """Beginning of a file of each kind."""

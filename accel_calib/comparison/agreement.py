@@ -53,7 +53,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from ..calibration import Calibration, fit_unknown, in_g, NORM_MODELS
+from ..calibration import Calibration, fit_unknown, in_g, NORM_MODELS, PRIOR
 from ..effects import add_history, Context, Model, predict
 from ..errors import InputError, RefusedFitError
 from ..estimate import judge, scatter_of
@@ -247,9 +247,10 @@ def comparable(calibrations: Sequence[Calibration]) -> tuple[Comparable, ...]:
                          f'{other}, expected the same unit, because the conversion is not known',
                          'fit all runs from readings in one unit')
     for k, run in enumerate(calibrations, 1):
-        if not run.model.effects:
-            raise InputError(f'run {k} is a mounting alone, expected a fit of offset and gain',
-                             'leave it out, or fit it with more poses')
+        if run.method == PRIOR and not run.form.effects:
+            what = 'an offset over temperature' if run.model.effects else 'a mounting'
+            raise InputError(f'run {k} is {what} alone, expected a fit of offset and gain',
+                             'leave it out, or fit it with poses in many directions')
         if not np.all(np.isfinite(run.covariance)):
             raise InputError(f'run {k} has no uncertainty, expected a finite covariance',
                              'fit it again with more poses')

@@ -23,6 +23,7 @@ from .agreement import (
 from ..calibration import Calibration
 from ..effects import Context, length_rows, sensor_force
 from ..errors import InputError
+from ..finding import has
 from ..geometry import OVER_THE_SPHERE
 from ..statistics import rms
 from ..text import counted, listed
@@ -60,15 +61,26 @@ def _notes_of(given: Sequence[Comparable], names: tuple[str, ...], deviation: Fl
     for runs, found in omitted.items():
         yield (f'the model of {listed("run", runs)} omits {", ".join(found)} and so assumes zero; '
                'for an equal comparison, fit all runs with one model')
+    yield from _notes_of_context(calibrations)
+    yield from (f'the file of run {k} was edited by hand since it was stored'
+                for k, run in enumerate(calibrations, 1) if has(run.noted, 'edited'))
+    for k in noisier:
+        yield (f'the poses of run {k + 1} repeat significantly worse than those of the others: '
+               'the run has less weight')
+
+
+def _notes_of_context(calibrations: Sequence[Calibration]) -> Iterator[str]:
     known = [float(np.median(run.poses['temperature'])) for run in calibrations
              if 'temperature' in run.poses]
     corrected = all('temperature' in run.model.needs for run in calibrations)
     if len(known) >= 2 and not max(known) - min(known) < _WARMER and not corrected:
         yield (f'the poses were taken at {min(known):.0f} to {max(known):.0f} °C, and not all '
                'runs correct for temperature: this can cause differences')
-    for k in noisier:
-        yield (f'the poses of run {k + 1} repeat significantly worse than those of the others: '
-               'the run has less weight')
+    for key in _COMMON:
+        unknown = [k for k, run in enumerate(calibrations, 1) if key not in run.poses]
+        if unknown and any(key in run.model.needs for run in calibrations):
+            yield (f'the {key.replace("_", " ")} of the poses of {listed("run", unknown)} is not '
+                   'known, and other runs correct for it: this can cause differences')
 
 
 @dataclass(frozen=True)

@@ -306,7 +306,7 @@ _REMARKS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
         'is too few to detect most effects: take 24 poses or more'),
     'scatter': lambda of: (
         f'poses repeat {of["ratio"]:.1f} times worse than their samples, and the scatter has no '
-        'structure: clamp the sensor, let it settle longer'),
+        'structure: clamp the sensor, let it settle longer, or check the unit of std, and count'),
     'record': lambda of: (
         f'record {"; ".join(of["columns"])}: their effects cannot be tested yet'),
     'not_searched': lambda of: (

@@ -385,15 +385,19 @@ def _sources(layout: TextLayout, given: Mapping[str, str]) -> dict[str, int]:
     if partly and not set(READING) <= set(found):
         raise InputError(f'--columns names {", ".join(sorted(partly))}, expected ax, ay and az',
                          'name all three')
-    if set(READING) <= set(header) and not set(READING) & set(found):
+    is_named = set(READING) <= set(header) and not set(READING) & set(found)
+    bare = header if is_named else [name.partition('[')[0].strip() for name in header]
+    if is_named:
         for name, count in Counter(header).items():
             if count > 1 and name in OURS:
                 raise InputError(f'{layout.path} has {count} columns {name}, expected one',
                                  'remove or rename the others')
-        found = {**{name: header.index(name) for own in COLUMNS.values()
-                    if not own.made and {*own.names} <= {*header} for name in own.names}, **found}
     elif not set(READING) <= set(found):
         found = {**_readings(layout), **found}
+    # Names that only a pose table has, which its readings may lack.
+    if is_named or any({*COLUMNS[key].names} <= {*bare} for key in ('std', 'reference')):
+        found = {**{name: bare.index(name) for own in COLUMNS.values()
+                    if not own.made and {*own.names} <= {*bare} for name in own.names}, **found}
     if header:
         found = {**_contexts(layout, found), **found}
     # What is not asked for, and holds other text than numbers, does not stand in the way.

@@ -251,7 +251,7 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
         head = next(blocks)
         check_units(head, quantities.units, str(path))
         if 'time' in head and are_samples(head.columns):
-            check_order(head['time'], str(path))
+            check_order(head['time'], head.reading, str(path))
             samples = (Recording(**vars(block)) for block in chain((head,), blocks))
             count = len(head)
             if text.more:  # the size of the file, and the rows of this block, tell about how many
@@ -281,9 +281,9 @@ def _without_holes(poses: Poses, findings: list[Finding]) -> Poses:
         holes = np.flatnonzero(~np.isfinite(poses[key]))
         if len(holes):
             findings.append(Finding(
-                'columns', f'not used, because {len(holes)} of {len(poses)} cells are not '
-                f'numbers: {key}', 'fill in these cells, or remove their rows',
-                rows=tuple(poses.row[holes].tolist())))
+                'not_used', f'{key} is not used, because of cells without a number '
+                f'({len(holes)} of {len(poses)})', f'fill in the cells of {key} that have no '
+                'number, or remove their rows', rows=tuple(poses.row[holes].tolist())))
             poses = poses.without_columns(key)
     return poses
 

@@ -196,7 +196,9 @@ def decide_quantities(columns: Chosen, first: Cells, options: LogOptions) -> Qua
     columns = made.chosen
     rows = dict.fromkeys(columns.sources, made.numbers(first, 'reading'))
     if 'time' in rows:
-        made.clock = clock_of(columns, first, options)
+        beside = {key: values for key, values in rows.items() if key != 'time'}
+        made.clock = clock_of(columns, first, options,
+                              of_poses=not are_samples(beside, _SPHERE_POINTS))
         made.notes += made.clock.doubts
         samples = are_samples({**rows, 'time': made.clock.seconds(first)})
     else:
@@ -299,6 +301,11 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions, *, samp
         name, factor = ('m/s2', 1.0) if is_si else rests.unit or ('native', 1.0)
     made.units = units_of(name, options.gravity)
     made.scales['reading'] = factor, 0.0
+    for key in {'std', 'reference'} & columns.sources.keys():  # in their own unit, if it is stated
+        unit, scale = unit_of('reading', columns.layout.unit(columns.sources[key][0])) or (name, factor)
+        if not made.units.is_native:
+            scale *= made.units.per_g / units_of(cast(UnitName, unit), options.gravity).per_g
+        made.scales[key] = scale, 0.0
     is_ours = columns.names('reading') == [*READING] and (stated or made.units.is_si)
     if made.said or not is_ours:
         made.said.append(_words(columns, rests, made.units, factor, stated=bool(stated)))
@@ -433,17 +440,17 @@ def _quiet_windows(reading: Floats, *beside: Floats) -> list[Floats]:
     return [values[quiet] for values in windows]
 
 
-def are_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
+def are_samples(columns: Mapping[str, NDArray[Any]], fewest: int = _FEW_POSES) -> bool:
     """
     Return whether rows are samples: not marked as poses, and dense in time or many.
 
-    Rows without times are if a person does not take as many poses, or if they are many and have
+    Rows without times are if a person does not take as many poses, or if they are not few and have
     angular rates, are mostly like the row before, all have about the same direction, or are on no
     sphere.
 
     """
     readings = columns['reading']
-    if OF_POSES & columns.keys() or len(readings) < (2 if 'time' in columns else _FEW_POSES):
+    if OF_POSES & columns.keys() or len(readings) < (2 if 'time' in columns else fewest):
         return False
     if 'time' in columns:
         apart = abs(float(np.median(np.diff(columns['time']))))
@@ -462,7 +469,7 @@ def are_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
 def _leave_out(made: Quantities, key: str, why: str, advice: str) -> None:
     made.chosen = replace(made.chosen, sources={
         name: own for name, own in made.chosen.sources.items() if name != key})
-    made.findings.append(Finding('columns', f'{why} not used', advice))
+    made.findings.append(Finding('not_used', f'{why} not used', advice))
 
 
 def _decide_rate(made: Quantities, first: Cells) -> None:
@@ -486,7 +493,7 @@ def _decide_rate(made: Quantities, first: Cells) -> None:
     seen = next(iter(rests.items())) if rests and len(rests) == 1 else None
     unit, factor = stated or seen or (
         ('rad/s', 1.0) if largest < _LIKELY_RATE else ('°/s', DEGREE_RAD))
-    made.scales['rate'] = factor, 0.0
+    made.scales |= dict.fromkeys(('rate', 'rate_std'), (factor, 0.0))
     read_as = f'{words} in {unit}{"" if unit == "rad/s" else " -> rad/s"}'
     made.said.append(read_as if stated else f'{read_as} (assumed)')
     if not stated:

@@ -74,6 +74,11 @@ _COARSE_S, _COARSE_ROWS = 0.05, 3.0
 _UNSORTED, _MANY_STEPS = 0.2, 50
 """Share of steps back in time above which rows are in no order, of at least so many steps."""
 
+_SENSORS, _UNLIKE, _APART = (2, 3, 4), 5.0, 0.2
+"""Numbers of sensors whose rows can alternate; the factor by which readings and steps in time
+then differ more than those of one; and the least difference of their readings if the times are
+even, relative to 1 g: less can be vibration at half the rate of the samples."""
+
 _MANY_ROWS = 500
 _WINDOW = 8
 _AT_REST = 0.3
@@ -151,9 +156,9 @@ class Clock:
         return seconds + total + within
 
 
-def clock_of(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
-    """Return the clock of a log with times, from its first block."""
-    clock = _stated_clock(columns, first, options)
+def clock_of(columns: Chosen, first: Cells, options: LogOptions, *, of_poses: bool) -> Clock:
+    """Return the clock of a log with times, from its first block of samples or poses."""
+    clock = _stated_clock(columns, first, options, of_poses)
     steps = np.diff(clock.seconds(first))
     moving = steps[steps != 0.0]
     clock.newest_first = len(moving) > 1 and bool(np.mean(moving < 0.0) > _REVERSED)
@@ -166,8 +171,8 @@ def clock_of(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
     return clock
 
 
-def check_order(time: Floats, source: str) -> None:
-    """Raise InputError if the times of many samples are equal, or in no order."""
+def check_order(time: Floats, reading: Floats, source: str) -> None:
+    """Raise InputError if times of many samples are equal or in no order, or rows alternate."""
     steps = np.diff(time)
     back = int(np.count_nonzero(steps < 0.0))
     if len(steps) >= _MANY_STEPS and not np.any(steps):
@@ -178,9 +183,19 @@ def check_order(time: Floats, source: str) -> None:
         raise InputError(f'{source}: the times of {back} of {len(steps)} rows are before that of '
                          'the row above, expected rows in the order of their times',
                          'sort the rows by their times')
+    values = {0: reading[1:], 1: steps[:, np.newaxis]}
+    for number in _SENSORS if len(steps) >= _MANY_STEPS else ():
+        near, far = ({key: float(np.median(np.linalg.norm(each[apart:] - each[:-apart], axis=1)))
+                      for key, each in values.items()} for apart in (number, 1))
+        is_far = far[0] > _APART * float(np.median(np.linalg.norm(reading, axis=1)))
+        if near[0] * _UNLIKE < far[0] and (is_far or near[1] * _UNLIKE < far[1]):
+            raise InputError(f'{source}: each reading is like that {number} rows above and unlike '
+                             f'that of the row above: the rows of {number} sensors alternate, '
+                             'expected one sensor',
+                             'write the rows of each sensor to a file of its own')
 
 
-def _stated_clock(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
+def _stated_clock(columns: Chosen, first: Cells, options: LogOptions, of_poses: bool) -> Clock:
     """Return the clock with the unit that is stated, or found from the rate."""
     (column,), layout = columns.sources['time'], columns.layout
     name, rate_hz = layout.name(column), options.rate or layout.rate_hz
@@ -205,7 +220,7 @@ def _stated_clock(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
         raise InputError(f'{layout.path} has no header line, and column {name} does not increase, '
                          'expected times',
                          'add a header line, or name the columns with --columns ax=1,ay=2,az=3')
-    unit = _unit_of_time(columns, first, stamps)
+    unit = _unit_of_time(columns, first, stamps, of_poses)
     scale = {**_UNITS, _TICK: 1e-4}[unit]
     step = scale * _step_of(stamps)
     named = f'column {name}' if name.isdecimal() else name
@@ -218,7 +233,7 @@ def _stated_clock(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
     return Clock(columns, scale, _PERIODS_S.get(unit, ()), words, doubts)
 
 
-def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
+def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats, of_poses: bool) -> str:
     (column,), layout = columns.sources['time'], columns.layout
     of_maker = columns.maker and columns.maker.scales.get('time')
     if of_maker:
@@ -226,11 +241,11 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
     stated = unit_of('time', layout.unit(column))
     if stated:
         return stated[0]
-    step, of_poses = _step_of(stamps), 'count' in columns.sources
+    step, is_counted = _step_of(stamps), 'count' in columns.sources
     if layout.header and layout.name(column) == 'time' and step < (
-            _POSES_FAR_S if of_poses else _FAR_S):
-        is_marked = bool(layout.about) or of_poses
-        is_ours = is_marked or columns.names('reading') == [*READING]
+            _POSES_FAR_S if is_counted else _FAR_S):
+        is_marked = bool(layout.about) or is_counted
+        is_ours = is_marked or of_poses or columns.names('reading') == [*READING]
         # A sensor that is logged each ten seconds is nearly always still. In a recording of turns
         # and rests the scatter within many short windows is much larger than that at rest. Of real
         # recordings by hand that is 10 % of the windows or more, of 58 h at rest 1 %.

@@ -318,7 +318,7 @@ def _conclude(calibration: Calibration, found: Found, given: Given) -> Refinemen
         remarks = remarks_on(found, steps, missing, len(calibration.rejected))
         state = State(judge(Model(calibration.model.values), alone))
         return _record_of(calibration, state, missing, remarks)
-    of_search = [*rejected_by(found.final.model, given.poses_g.take(found.outliers))]
+    of_search = [*rejected_by(found.final.model, given.poses_g, found.outliers)]
     if found.clipped is not None:
         of_search += [Rejected(int(row), CLIPPED, 'clipped')
                       for row in given.poses_g.row[found.clipped.poses]]

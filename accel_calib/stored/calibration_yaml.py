@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields, replace
 import hashlib
 from pathlib import Path
+import re
 from typing import Any, get_args, TypeVar
 
 import numpy as np
@@ -28,7 +29,7 @@ from .. import __version__
 from ..calibration import (
     Calibration, FleetPrior, gated, GyroBias, in_g, LARGEST_OFFSET_G, Quality, Rejected,
     RejectedKind, SampleNoise, STORED_METHODS)
-from ..disk import FIRST_LINE, FORMAT, write_atomically
+from ..disk import BEFORE, FIRST_LINE, FORMAT, write_atomically
 from ..effects import (
     add_history, CHANGES, effect_named, EffectKey, entry_of, factors_of, Model, MODELS, OwnEffect,
     parameter_names, PROCESSES)
@@ -181,7 +182,7 @@ def _checked(data: bytes, name: str, own: Sequence[OwnEffect]) -> Calibration:
     """Return the calibration in a file after all checks; other errors are those of damage."""
     if not data.strip(b'\0 \t\r\n'):
         raise ValueError('it is empty')
-    if not data.startswith(FIRST_LINE.encode()):
+    if not re.match(BEFORE + FIRST_LINE.encode(), data):
         raise StoredCalibrationError(f'{name} is not a calibration of accel_calib, expected the '
                                      f'first line "{FIRST_LINE}"', 'use a file that fit wrote')
     text = decoded(data)

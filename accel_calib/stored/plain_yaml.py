@@ -72,7 +72,7 @@ def decoded(data: bytes) -> str:
     if len(data) > MOST_BYTES:
         raise ValueError(f'it has more than {MOST_BYTES} bytes')
     try:
-        return data.decode().replace('\r\n', '\n').replace('\r', '\n')
+        return data.decode('utf-8-sig').replace('\r\n', '\n').replace('\r', '\n')
     except UnicodeDecodeError as err:
         line = 1 + data.count(b'\n', 0, err.start)
         raise ValueError(f'line {line} is not text in UTF-8') from err
