@@ -21,7 +21,7 @@ from accel_calib.api import in_units_of
 from accel_calib.calibration import Calibration, determines, posterior, refuse_if_unfit, sound_rows
 from accel_calib.calibration.directions import poses_needed, rows_of, shape_words
 from accel_calib.calibration.mounting import (
-    axes_of, doubts_about_flat, fault_of, mounting, with_heading, with_heading_of)
+    axes_of, doubts_about_flat, fault_of, mounting, with_heading)
 from accel_calib.calibration.partial import common_sensors, without_knocked
 from accel_calib.calibration.planning import choose_levels, find_undetermined, missing_poses
 from accel_calib.cli.commands import COMMANDS, HIDDEN as DEMO_CHOICES, parser
