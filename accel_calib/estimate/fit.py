@@ -57,9 +57,6 @@ _AT_A_KINK = 1e3
 _ROUNDING = 1e-20
 """Decreases of the cost below this are rounding errors [noise²]."""
 
-_HOPE = 3.0
-"""Largest ratio of the decrease of the cost to that which the next step predicts."""
-
 _SINGULAR_STEP = 1e-6
 """Relative square of a singular value below which the residuals do not determine a combination."""
 
@@ -349,15 +346,14 @@ class Point:
 
 
 def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upper: Floats,
-          move: Callable[[Floats, Floats], Floats] = np.add, most: float = np.inf
-          ) -> tuple[Floats, Point]:
+          move: Callable[[Floats, Floats], Floats] = np.add) -> tuple[Floats, Point]:
     """
     Return the (q,) values from `lower` to `upper` of least squares, and the point there.
 
     `point_at` computes residuals and derivative at values, which may be so wild that numbers
     overflow; the step solves residual = columns · step. `move` returns the values after a step to
     first order, by default their sum. Raise `NotConvergedError` if the fit has not converged after
-    `_MOST_STEPS` steps, or as soon as it cannot lower the cost to `most`.
+    `_MOST_STEPS` steps.
 
     """
     values = np.clip(start, lower, upper)
@@ -382,8 +378,6 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
         if (fall <= _NEAR * now.cost or fall < _ROUNDING or damping > _LARGEST_DAMPING
                 or steps == _MOST_STEPS):
             break
-        if now.cost - _HOPE * fall > most:
-            raise NotConvergedError
         moved = np.clip(move(values, axes @ (downhill / (scales + damping)) * weight),
                         lower, upper)
         tried = _try(point_at, moved)
@@ -424,7 +418,7 @@ class Prior:
 
 
 def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
-             factor: float | None = None, most: float = np.inf) -> Fit:
+             factor: float | None = None) -> Fit:
     """
     Fit a model; raise `NotConvergedError` if the fit does not converge.
 
@@ -437,8 +431,6 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
     prior, factor : Prior and float, optional
         Distribution of the values of model 10 over sensors, and the variance factor of the noise
         beside it. By default it is 1 in the fit, and that of the residuals in the covariance.
-    most : float, optional
-        Cost above which the fit is not needed. It then ends early, as one that does not converge.
 
     """
     if not np.any(start.fitted):
@@ -461,7 +453,7 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
     lower, upper = _bounds(start, poses_g)
     lower, upper = lower[fitted], upper[fitted]
     values, found = solve(point_at, start.vector[fitted], lower, upper,
-                          move=np.add if prior is None else along_quadrics, most=most)
+                          move=np.add if prior is None else along_quadrics)
     at_bound = bool(np.any((values <= lower) | (values >= upper)))
     model, near = found.source
     count = len(near.residual)

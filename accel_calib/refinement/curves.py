@@ -11,7 +11,8 @@ of a few cosines over the range of the variable (`accel_calib.effects.EmpiricalC
 spherical harmonics of a few degrees over the direction of the force, which are the forms of
 nonlinearities along oblique axes. For each carrier and variable, the cosines or degrees are added
 in the order of their gain while the score of `.linear` rises; each costs its values and 2 log k
-for the choice of the k-th. The best curve is taken if it is significant.
+for the choice of the k-th. The best curve is taken if it is significant. The score is strict, so
+further modes next to those of the curve are added while they lower its held-out residual.
 
 **Wander.** The effect `offset_wander` is an offset that changes slowly. It is a random process,
 expanded in its Karhunen-Loève modes
@@ -54,6 +55,9 @@ _LEAST_DOF = 30
 
 _PATIENCE = 2
 """Cosines without a better score after which no more are added; a wave needs several."""
+
+_FALL = 3.0
+"""Decrease of the held-out squares, in variances, by which a further mode pays for each value."""
 
 CLEARLY = 10.0
 """Smallest score of a curve."""
@@ -225,6 +229,16 @@ def _grown(problem: Linear, least_rss: float, least: float) -> Set:
     return best
 
 
+def _extended(chosen: Set) -> Set:
+    """Return a curve with further modes, within 2 of its own, that lower its held-out squares."""
+    near = {block + step for block in chosen.blocks for step in range(-2, 3)} - {*chosen.blocks}
+    larger = [new for block in near & {*range(len(chosen.linear.blocks))}
+              if (new := chosen.extended(block)).parameters <= _LARGEST_SHARE * new.linear.dof]
+    best = min(larger, key=_held_out, default=chosen)
+    price = _FALL * (best.parameters - chosen.parameters) * chosen.variance
+    return _extended(best) if _held_out(best) + price < _held_out(chosen) else chosen
+
+
 def _accepted(score: float, chosen: Set, tried: int) -> FoundCurve | None:
     """Return a curve, or None if it is not significant."""
     # The outliers are found again: without the curve, good poses may have looked like outliers.
@@ -234,6 +248,7 @@ def _accepted(score: float, chosen: Set, tried: int) -> FoundCurve | None:
         each.tried for each in chosen.entries))
     if p_value > LEVEL:
         return None
+    chosen = _extended(chosen)
     blocks, first = sorted(chosen.blocks), chosen.entries[0]
     waves = [cast(EmpiricalCurve, chosen.linear.blocks[block].effect) for block in blocks]
     curve = replace(waves[0], modes=tuple(wave.modes[0] for wave in waves))
@@ -338,8 +353,7 @@ _SURER = 4.0
 tables whose deviations were too small, none was called a walk."""
 
 
-@dataclass(frozen=True)
-class Process:
+class Process(NamedTuple):
     """Orthonormal modes of a walk outside of the base, (m, r), and their relative variances."""
 
     axes: Floats
@@ -384,11 +398,9 @@ class Walk:
 
 def process_of(linear: Linear, poses: Poses) -> Process | None:
     """Return the modes of a walk; None if the times are not known."""
-    if 'time' not in poses:
-        return None
-    time = poses['time']
+    time = poses.columns.get('time', np.zeros(0))
     known = np.isfinite(time)
-    if not np.any(known) or not np.ptp(time[known]) > 0.0:
+    if len(np.unique(time[known])) < 2:
         return None
     tau = np.where(known, time - np.min(time[known]), 0.0) / float(np.ptp(time[known]))
     number = np.pi * (np.arange(min(int(np.sum(known)), _MODES)) + 0.5)

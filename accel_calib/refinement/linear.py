@@ -218,12 +218,6 @@ class Linear:
         few = whole / np.maximum(whole - parameters - 1.0, 1e-9)
         return fall - few * parameters * math.log(max(self.dof, 2)) - charge - self.penalty
 
-    def rss_of(self, score: float, parameters: float, charge: float) -> float:
-        """Return the RSS with which a set has a score."""
-        room = float(self.score(self.base_rss, parameters, charge)) - score
-        ratio = math.exp(min(room / (self.worth + self.dof), 100.0))  # no overflow
-        return (self.worth + self.base_rss) * ratio - self.worth
-
     @cached_property
     def costs(self) -> tuple[Floats, Floats]:
         """(b,) arrays, values searched of each block, and what its choice costs."""

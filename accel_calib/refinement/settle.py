@@ -289,12 +289,12 @@ class Trial:
         same = all(new is old for new, old in zip(tried, self.tried, strict=True))
         return None if same else replace(self, tried=tried)
 
-    def fitted(self, chosen: Set, state: State, most: float = np.inf) -> State | None:
-        """Return the fit of a set; None without a sound fit below `most`."""
+    def fitted(self, chosen: Set, state: State) -> State | None:
+        """Return the fit of a set; None without a sound fit."""
         model = {name: part for name, part in state.model.values.items() if name in self.fixed}
         for effect, values in chosen.values.items():
             model = with_effect(model, effect, values)
-        after = fitted_state(Model(model), without(self.poses_g, chosen.out), most)
+        after = fitted_state(Model(model), without(self.poses_g, chosen.out))
         if after is None or not chosen.blocks:
             return after
         return None if after.fit.at_bound or not has_usual_gains(after.model) else after
@@ -348,17 +348,14 @@ def settle(state: State, poses_g: Poses, fixed: tuple[EffectKey, ...],
 
 def _best_fit(near: Near, state: State, trial: Trial) -> tuple[Near, State | None]:
     """Return the fit of a set, or of a reshaped one whose fit has a better score."""
-    def score_of(chosen: Set, fitted: State) -> float:
-        return float(near.plain.score(fitted.rss, chosen.parameters, chosen.charge))
+    def score_of(fit: tuple[Near, State]) -> float:
+        chosen = fit[0].chosen
+        return float(near.plain.score(fit[1].rss, chosen.parameters, chosen.charge))
 
-    best, after = near, trial.fitted(near.chosen, state)
-    most = -np.inf if after is None else score_of(near.chosen, after)
-    for other in sorted(reshaped(near.chosen), key=lambda other: -other.score):
-        fitted = trial.fitted(other, state,
-                              near.plain.rss_of(most, other.parameters, other.charge))
-        if fitted is not None and score_of(other, fitted) > most:
-            best, after, most = replace(near, chosen=other), fitted, score_of(other, fitted)
-    return best, after
+    tried = [near, *(replace(near, chosen=other) for other in reshaped(near.chosen))]
+    fits = [(each, after) for each in tried
+            if (after := trial.fitted(each.chosen, state)) is not None]
+    return max(fits, key=score_of, default=(near, None))
 
 
 def _best_near(linear: Linear, trial: Trial, refused: set[frozenset[EffectKey]]) -> Near:

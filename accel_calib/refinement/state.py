@@ -352,10 +352,10 @@ def beginning(poses_g: Poses, model: Model) -> State:
     return State(estimate(model, add_history(poses_g, model)))
 
 
-def fitted_state(model: Model, poses_g: Poses, most: float = np.inf) -> State | None:
-    """Return the state of a model fitted to poses; None without a sound fit below `most`."""
+def fitted_state(model: Model, poses_g: Poses) -> State | None:
+    """Return the state of a model fitted to poses; None without a sound fit."""
     try:
-        return State(estimate(model, poses_g, most=most))
+        return State(estimate(model, poses_g))
     except NotConvergedError:
         return None
 
