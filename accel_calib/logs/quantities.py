@@ -302,7 +302,8 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions, *, samp
     made.units = units_of(name, options.gravity)
     made.scales['reading'] = factor, 0.0
     for key in {'std', 'reference'} & columns.sources.keys():  # in their own unit, if it is stated
-        unit, scale = unit_of('reading', columns.layout.unit(columns.sources[key][0])) or (name, factor)
+        stated_unit = columns.layout.unit(columns.sources[key][0])
+        unit, scale = unit_of('reading', stated_unit) or (name, factor)
         if not made.units.is_native:
             scale *= made.units.per_g / units_of(cast(UnitName, unit), options.gravity).per_g
         made.scales[key] = scale, 0.0

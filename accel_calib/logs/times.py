@@ -257,14 +257,13 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats, of_poses: bool)
             is_ours = not np.mean(scatter > _MOVES * at_rest) > _MOVING
         if is_ours:
             return 's'
-    return _likely_unit(columns, first, stamps) if step > 0.0 else 's'
+    return _likely_unit(columns, first, stamps, of_poses) if step > 0.0 else 's'
 
 
-def _likely_unit(columns: Chosen, first: Cells, stamps: Floats) -> str:
+def _likely_unit(columns: Chosen, first: Cells, stamps: Floats, of_poses: bool) -> str:
     """Return the unit with a plausible rate, best one that the file states; else s."""
     (column,), layout = columns.sources['time'], columns.layout
-    step, of_poses = _step_of(stamps), 'count' in columns.sources
-    units = TICKS.get(bare_name(layout.name(column)), _UNITS)
+    step, units = _step_of(stamps), TICKS.get(bare_name(layout.name(column)), _UNITS)
     rates = {name: 1.0 / (step * unit) for name, unit in units.items()}
     plausible = [name for name, rate in rates.items() if RATES_HZ[0] * 0.9 <= rate
                  <= RATES_HZ[1] * 1.1]
