@@ -1,5 +1,6 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
+# flake8: noqa: F401
 
 """
 Effects: what each adds to the reading, and its properties.
@@ -51,20 +52,3 @@ from .records import (
     variable_words, VARIABLES)
 from .simulate import model_with, parse_effect, simulate_poses, simulate_recording, turn_between
 from .thermal import acting_temperature, between_steps, covariance_of_steps, rate_at, ThermalStream
-
-__all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CATALOGUE', 'CHANGES', 'CONVERGED_G', 'COVARIATES',
-           'CUBE', 'EFFECTS', 'EMPIRICAL', 'FORCE', 'FROM_TEMPERATURE', 'LADDER',
-           'LARGEST_FORCE_G', 'LARGEST_ITERATIONS', 'MODELS', 'MONOMIALS', 'NOMINAL_SUPPLY',
-           'ODD_SQUARE', 'OFFSET_POWERS', 'ONE', 'PROCESSES', 'PRODUCT', 'REFERENCE_TEMPERATURE',
-           'SIZE', 'SQUARE', 'TO_SEPARATE', 'VARIABLES', 'WANDER', 'WAVE', 'ZONAL', 'ZONES',
-           'Context', 'Covariate', 'EachShape', 'Effect', 'EffectKey', 'EffectRecord',
-           'EmpiricalCurve', 'Model', 'ModelForm', 'OwnEffect', 'ParameterName', 'ThermalStream',
-           'acting_temperature', 'add_acting', 'add_history', 'between_steps', 'by_axis',
-           'check_context', 'context_of_samples', 'correct', 'covariance_of_steps', 'curves_over',
-           'effect_named', 'effects_of_file', 'entry_of', 'factors_of', 'fitted_places',
-           'formula_of', 'included', 'kind_of', 'length_rows', 'linear_model', 'linear_values',
-           'model_with', 'modes_of', 'own_effects', 'own_slope', 'parameter_names', 'parse_effect',
-           'predict', 'rate_at', 'sensor_force', 'shown_name', 'simulate_poses',
-           'simulate_recording', 'terms_of', 'thermal_stream', 'times', 'too_large',
-           'turn_between', 'unchanged', 'unit_of', 'value_unit', 'variable_of', 'variable_words',
-           'with_vector']

@@ -1,5 +1,6 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
+# flake8: noqa: F401
 
 """
 The estimator: from poses and a list of effects to values. `calibrate` and `refine` use it.
@@ -18,10 +19,3 @@ from .fit import (
 from .outliers import (
     beside_scatter, covariance_with, fit_robust, LARGEST_SHARE, outliers, outliers_among, Rival,
     rivals, scatter_of, unseen_mistakes, with_scatter_of)
-
-__all__ = ['LARGEST_SHARE', 'TIES', 'Fit', 'NotConvergedError', 'Point', 'Prior', 'Rival',
-           'believable', 'beside_scatter', 'by_pose', 'closed_form', 'covariance_with', 'estimate',
-           'faces', 'fit_12', 'fit_robust', 'fit_sphere', 'judge', 'kinds', 'left_out',
-           'originals', 'outliers', 'outliers_among', 'pose_noise', 'rivals', 'scatter_of',
-           'sensing_axes', 'solve', 'start_of', 'stated', 'unseen_mistakes', 'variance_factor',
-           'with_scatter_of']

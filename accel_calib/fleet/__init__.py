@@ -1,5 +1,6 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
+# flake8: noqa: F401
 
 """
 Calibrations of many recordings on Dask: rows in a Parquet data set, grouped by sensor.
@@ -13,6 +14,3 @@ statistics, the typical values and the page of the fleet. `run` submits the task
 from .recording import Input, Options, recordings
 from .run import cluster, LIMIT_S, run, STATUS, Summary
 from .sensors import Store
-
-__all__ = ['LIMIT_S', 'STATUS', 'Input', 'Options', 'Store', 'Summary', 'cluster', 'recordings',
-           'run']

@@ -1,5 +1,6 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
+# flake8: noqa: F401
 
 """
 Reader of logs: text of any dialect, bags, flight logs of PX4 and ArduPilot, and DataFrames.
@@ -25,13 +26,3 @@ from .names import NAMES
 from .port import is_port, open_port
 from .quantities import are_samples
 from .text import LineReader, write_blocks, write_table
-
-__all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
-           'ANGULAR_VELOCITY_COVARIANCE', 'ARDUPILOT_REFERENCE', 'BAG', 'DEGREE', 'FORMATS',
-           'IMU_DOUBLES', 'LITTLE_ENDIAN', 'NAMES', 'NAME_AT', 'NINE', 'ORIENTATION',
-           'ORIENTATION_COVARIANCE', 'PER_MILLION', 'STAMP', 'STAMP_AT', 'SUFFIXES', 'THREE',
-           'ByAxis', 'Frame', 'Layout', 'LineReader', 'LogOptions', 'OpenLog', 'Piped', 'Progress',
-           'are_samples', 'field_of', 'imus_of', 'is_bag', 'is_port', 'joined', 'layout_of',
-           'layout_with', 'messages_of', 'named_topics', 'open_bag', 'open_log', 'open_port',
-           'parts_of', 'read_poses', 'read_recording', 'topic_and_field', 'write_blocks',
-           'write_table']

@@ -1,5 +1,6 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
+# flake8: noqa: F401
 
 """
 Correction of sensor_msgs/Imu messages, from bags and from topics.
@@ -12,6 +13,3 @@ of bags.
 from .bags import correct_bag
 from .correction import (
     corrected, Known, motion_of, OneReading, output_frame, output_scale, Rewriter, Triple)
-
-__all__ = ['Known', 'OneReading', 'Rewriter', 'Triple', 'correct_bag', 'corrected', 'motion_of',
-           'output_frame', 'output_scale']

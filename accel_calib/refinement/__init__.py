@@ -1,5 +1,6 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
+# flake8: noqa: F401
 
 """
 From poses and a calibration to the gap, the named effect and the larger model.
@@ -16,5 +17,3 @@ empirical curve. `steps` states what was found; `accel_calib.findings` has the w
 
 from .refinement import refine, Refinement, refitted
 from .steps import named_entries, Remark, Stage, Step
-
-__all__ = ['Refinement', 'Remark', 'Stage', 'Step', 'named_entries', 'refine', 'refitted']

@@ -1,5 +1,6 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
+# flake8: noqa: F401
 
 """
 Figures, and the pages of results: self-contained HTML files.
@@ -15,6 +16,3 @@ only when a figure is drawn.
 from .page import calibration_page, refinement_page, STORED, thermal_page, write_figures
 from .residuals import plot_residuals
 from .sheet import check_matplotlib, policy, write_page
-
-__all__ = ['STORED', 'calibration_page', 'check_matplotlib', 'plot_residuals', 'policy',
-           'refinement_page', 'thermal_page', 'write_figures', 'write_page']

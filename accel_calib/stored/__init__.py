@@ -1,5 +1,6 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
+# flake8: noqa: F401
 
 """
 Files of this package: calibrations and what a fleet of sensors has in common.
@@ -11,6 +12,3 @@ Files of this package: calibrations and what a fleet of sensors has in common.
 from .calibration_yaml import (
     calibration_bytes, calibration_from, OF_FILE, read_calibration, read_prior, write_calibration,
     write_priors)
-
-__all__ = ['OF_FILE', 'calibration_bytes', 'calibration_from', 'read_calibration', 'read_prior',
-           'write_calibration', 'write_priors']
