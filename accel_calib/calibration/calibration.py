@@ -439,12 +439,13 @@ class Calibration(Record):
         return covariance * self.force_per_g ** 2
 
     def held_context(self, context: Context | None) -> Context:
-        """Return a context limited to `ranges`."""
+        """Return a context limited to `ranges`; a value that is NaN becomes the middle."""
         if not context or not self.ranges:
             return context or {}
         known = add_acting(context, self.model)
-        return {**known, **{key: np.clip(known[key], *limits)
-                            for key, limits in self.ranges.items() if key in known}}
+        return {**known, **{
+            key: np.where(np.isnan(known[key]), self.typical[key], np.clip(known[key], *limits))
+            for key, limits in self.ranges.items() if key in known}}
 
     @cached_property
     def rating(self) -> Rating:
