@@ -348,9 +348,9 @@ _LEAST_WHITE = 0.5
 SIGNIFICANT = 8.0
 """Twice the logarithm of the likelihood ratio above which a walk is named."""
 
-_SURER = 4.0
-"""The same against a scatter may be smaller by this: it has a size, as a walk has. Of 48 simulated
-tables whose deviations were too small, none was called a walk."""
+_CHANCE = 4.0
+"""The same of a scatter against none, up to which it is chance (p 0.05) and is no rival of a walk.
+Of 48 simulated tables whose deviations were too small, none was called a walk."""
 
 
 class Process(NamedTuple):
@@ -365,8 +365,8 @@ class Walk:
     """
     A walk beside a set, with its variance relative to the noise, and the score of both.
 
-    The likelihood ratio is twice its logarithm, against no walk, or, plus `_SURER`, against an
-    offset that scatters from pose to pose.
+    The likelihood ratio is twice its logarithm, against no walk, or against an offset that scatters
+    from pose to pose by more than `_CHANCE`.
 
     """
 
@@ -449,7 +449,7 @@ def walk_beside(chosen: Set, process: Process) -> Walk:
         (linear.worth + (1.0 / spread) @ residual ** 2 + 1e-300)
         / (linear.worth + chosen.rss + 1e-300))
     return Walk(process, float(_RATIOS[best]), chosen.score + fall - _charge(linear),
-                fall - max(float(-np.min(of_scatter)) - _SURER, 0.0))
+                fall - max(float(-np.min(of_scatter)) - _CHANCE, 0.0))
 
 
 def _charge(linear: Linear) -> float:
