@@ -125,7 +125,7 @@ HEADERS = {
 def test_a_header_corrects_as_apply_does_in_c_and_in_cpp(to, compiled):
     texts = {name: text_of(each, to, name=name) for name, each in HEADERS.items()}
     readings, temperatures, _ = zip(*map(samples, HEADERS.values()))
-    for name, temperature in zip(HEADERS, temperatures, strict=True):  # nan: not known
+    for temperature in temperatures:  # nan: not known
         temperature[:3] = -40.0, 90.0, np.nan
     for found in compiled(texts, readings, temperatures):
         for name, forces, reading, temperature in zip(

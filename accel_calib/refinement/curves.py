@@ -365,8 +365,8 @@ class Walk:
     """
     A walk beside a set, with its variance relative to the noise, and the score of both.
 
-    The likelihood ratio is twice its logarithm, against no walk, or against an offset that scatters
-    from pose to pose by more than `_CHANCE`.
+    The likelihood ratio is twice its logarithm, against no walk, or against an offset that
+    scatters from pose to pose by more than `_CHANCE`.
 
     """
 

@@ -220,7 +220,8 @@ def header(calibration: Calibration, options: Options) -> Made:
                                             if zone.degree == degree))) for degree in degrees],
         'unit': 'm/s^2' if calibration.units.is_si else 'g', 'frame': frame_words(calibration),
         's': {'middle': made.middle, 'low': made.middle - made.half,
-              'high': made.middle + made.half, 'per_half': 1.0 / made.half} if made.of_temperature else None}
+              'high': made.middle + made.half, 'per_half': 1.0 / made.half,
+              } if made.of_temperature else None}
     return Made(values, lambda reading, temperature: (
         made.force(reading, temperature) / calibration.force_per_g), True)
 
