@@ -158,7 +158,7 @@ def lines_under_load(flood: Trials, many: Trials, seconds: float) -> Iterator[Li
                f'{share:.2f} ({ours:,.0f} of {bare:,.0f})', len(flood['node']), '≥ 0.85',
                share >= 0.85)
     node = many['node'][0]
-    yield Line(f'8 kHz for {seconds:.0f} s, depth 100: messages lost', f'{node.lost} of '
+    yield Line(f'8 kHz for {seconds:.0f} s: messages lost', f'{node.lost} of '
                f'{len(node.sent):,} (bare relay: {many["serialized"][0].lost})', 1, '0',
                node.lost == 0)
 

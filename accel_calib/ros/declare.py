@@ -4,7 +4,8 @@
 """
 What the nodes declare: their parameters, quality of service and static transforms.
 
-At 1 kHz, a busy machine loses a few messages in 10,000 with depth 10, and none with depth 100.
+A node must bridge the time of a batch: at 8 kHz it loses 8 messages in 10,000 with depth 100, and
+none with depth 1000.
 
 Transforms of a URDF that do not move arrive on /tf_static in several latched messages, often from
 several nodes. Only their rotations are needed. The message type is in tf2_msgs, which is imported
@@ -91,7 +92,7 @@ def follow(node: Node, settings: Callable[[], Settings],
     return on_set
 
 
-SENSOR = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+SENSOR = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """For messages of drivers; it also matches reliable publishers."""
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
