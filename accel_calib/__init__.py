@@ -51,8 +51,6 @@ Arrays are (n, 3): one row per pose or sample, columns x, y, z. A vector in fram
 
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TYPE_CHECKING

@@ -79,8 +79,14 @@ class Driver:
     def poses(self) -> Any:
         return self.session.sensor.live.poses()
 
-    def feed(self, readings: Any, frame_id: str = 'imu_link', **context: float) -> int:
-        """Push readings [m/s²] with their context, and return the number of accepted messages."""
+    def feed(self, readings: Any, frame_id: str = 'imu_link', rate: float = np.nan,
+             **context: float) -> int:
+        """
+        Push readings [m/s²] with their context, and return the number of accepted messages.
+
+        The `rate` [rad/s] is that about each axis.
+
+        """
         accepted, columns = 0, columns_of(self.session.state.settings)
         for column, value in context.items():
             self.session.state.around.take(column, value)
@@ -89,7 +95,7 @@ class Driver:
             if self.session.accepts(frame_id):
                 rows = np.full((len(block), 7 + len(columns)), np.nan)
                 rows[:, 0] = self.stamp + self.pace * np.arange(len(block)) / RATE
-                rows[:, 1:4] = block
+                rows[:, 1:4], rows[:, 4:7] = block, rate
                 rows[:, 7:] = [context.get(column, np.nan) for column in columns]
                 self.session.push(rows, self.now)
                 accepted += len(block)

@@ -410,15 +410,16 @@ def test_a_start_without_a_column_leaves_it_in_the_stored_poses(
             ([UP, LEFT, FORWARD], known, 0), ([[0, 0, -1]], {}, 1), ([[0, -1, 0]], known, 1))):
         driver = Driver(sensor='arm', **given)
         driver.stamp += 500.0 * k
-        driver.feed(readings(way), **({} if k == 1 else {column: 25.0 + k}))
-        driver.feed(readings([way[-1]])[:15], **({} if k == 1 else {column: 25.0 + k}))
+        driver.feed(readings(way), rate=0.0, **({} if k == 1 else {column: 25.0 + k}))
+        driver.feed(readings([way[-1]])[:15], rate=0.0, **({} if k == 1 else {column: 25.0 + k}))
         driver.tick()
         assert np.sum(np.isnan(driver.poses[column])) == lack
         assert ('1 of 5 poses' in driver.logged('info')) is (k == 2 and bool(known))
         assert column not in driver.sensor.live.poses_for_fit(()) or not lack
-        fitted = driver.sensor.live.poses_for_fit((), [column])
+        fitted = driver.sensor.live.poses_for_fit((), ['rate', column])
         assert (column in fitted, len(fitted)) == (True, len(driver.poses) - lack)
-        assert ('1 pose without' in ''.join(each.text for each in fitted.findings)) is bool(lack)
+        assert (f'1 pose without {column} left out' in [each.text for each in fitted.findings]
+                ) is bool(lack)
         driver.session.close()
         if k == 1:
             with open_log(driver.session.state.files.store.poses) as log:  # as a command reads it

@@ -347,20 +347,20 @@ class Expected:
         Number of equations of distinct poses beyond the number of free values. The errors of poses
         with known forces are vectors.
     noise_mg, before_mg : float or None
-        Noise of a pose, RMS over the poses, and the error without the calibration and without
-        noise; None if it is not known.
+        Noise of a pose [mg], RMS over the poses, and the error without the calibration and without
+        noise [mg]; None if it is not known.
     stated_mg, worst_mg : float
-        Stated uncertainty, RMS over the sphere (partial: over the poses), and the largest one.
+        Stated uncertainty [mg], RMS over the sphere (partial: over the poses), and the largest.
     few : float
         Factor on the uncertainty because few poses check the noise.
     hidden_mg : float
-        Residual beyond the noise; without known noise, the residual.
+        Residual beyond the noise [mg]; without known noise, the residual.
     is_beyond_noise : bool
         Whether the poses show what the model does not contain.
     inexact_mg, error_mg : float
-        Part of the expected error that more poses reduce, and the whole, as a bound.
+        Part of the expected error that more poses reduce, and the whole, as a bound [mg].
     own_mg : float
-        Expected error by what the poses show, without omitted values.
+        Expected error by what the poses show, without omitted values [mg].
 
     """
 

@@ -187,10 +187,10 @@ def _find_missing(expected: Expected, refinement: Refinement | None) -> Iterator
                 step = 'poses'
         elif any(step.effect == WANDER for step in refinement.steps):
             what = f'{begin}: the offset changed slowly with time ({WANDER})'
-            advice = _supplement(expected, 'let the sensor warm up, and take the poses within a '
-                                 'few minutes')
+            advice = _advise(expected, 'let the sensor warm up, and take the poses within a '
+                             'few minutes')
         else:
-            what, advice = f'{begin}, and no effect explains them', _supplement(expected, _CHECK)
+            what, advice = f'{begin}, and no effect explains them', _advise(expected, _CHECK)
         yield Finding('beyond_noise', what, advice, 'USABLE', step=step)
     for name, size in expected.not_corrected:
         if size <= MATTERS.value:
@@ -199,7 +199,7 @@ def _find_missing(expected: Expected, refinement: Refinement | None) -> Iterator
         context = {*(entry.over or entry.needs)}
         if 'time' in context and 'since_turn' not in context:
             yield Finding('settling', f'the readings changed with time by {mg(size)} ({short}), '
-                          'and may change again', _supplement(
+                          'and may change again', _advise(
                               expected, 'let the sensor settle, and take the poses again'),
                           'USABLE')
         else:
@@ -243,13 +243,13 @@ def _remedy(expected: Expected, refinement: Refinement | None) -> dict[str, Any]
     if expected.hidden_mg <= BOUND * expected.stated_mg:
         return {'advice': _more_poses(expected), 'step': 'poses'}
     if refinement is not None:
-        return {'advice': _supplement(expected, _CHECK), 'step': 'poses'}
+        return {'advice': _advise(expected, _CHECK), 'step': 'poses'}
     return {'step': 'refine', 'advice': _REFINE if expected.noise_mg is not None else
             'hold the sensor still in each pose, record std and count, and run refine to find '
             'what is missing'}
 
 
-def _supplement(expected: Expected, otherwise: str) -> str:
+def _advise(expected: Expected, otherwise: str) -> str:
     """Return the advice on a column that is not used, which may be the cause, or another one."""
     return next((each.advice for each in expected.calibration.noted if each.kind == 'not_used'),
                 otherwise)

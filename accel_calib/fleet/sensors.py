@@ -134,8 +134,8 @@ class Store:
         if rows:
             write_parquet(data, sorted(rows, key=lambda row: (
                 row['date'] or '', row['recording'])), schema())
-        else:
-            shutil.rmtree(data.parent, ignore_errors=True)
+        elif data.exists():
+            shutil.rmtree(data.parent)
         for key in {row['key'] for row in (*old, *added)} - {row['key'] for row in rows}:
             self.mark(key).unlink(missing_ok=True)
             for path in (self.folder / 'calibrations' / name).glob(f'{key}*'):

@@ -183,16 +183,20 @@ def check_order(time: Floats, reading: Floats, source: str) -> None:
         raise InputError(f'{source}: the times of {back} of {len(steps)} rows are before that of '
                          'the row above, expected rows in the order of their times',
                          'sort the rows by their times')
-    values = {0: reading[1:], 1: steps[:, np.newaxis]}
     for number in _SENSORS if len(steps) >= _MANY_STEPS else ():
-        near, far = ({key: float(np.median(np.linalg.norm(each[apart:] - each[:-apart], axis=1)))
-                      for key, each in values.items()} for apart in (number, 1))
-        is_far = far[0] > _APART * float(np.median(np.linalg.norm(reading, axis=1)))
-        if near[0] * _UNLIKE < far[0] and (is_far or near[1] * _UNLIKE < far[1]):
+        far, uneven = _change(reading, 1), _change(steps[:, np.newaxis], 1)
+        is_far = far > _APART * float(np.median(np.linalg.norm(reading, axis=1)))
+        if _change(reading, number) * _UNLIKE < far and (
+                is_far or _change(steps[:, np.newaxis], number) * _UNLIKE < uneven):
             raise InputError(f'{source}: each reading is like that {number} rows above and unlike '
                              f'that of the row above: the rows of {number} sensors alternate, '
                              'expected one sensor',
                              'write the rows of each sensor to a file of its own')
+
+
+def _change(values: Floats, rows: int) -> float:
+    """Return the median distance of (n, k) values from those a number of rows above."""
+    return float(np.median(np.linalg.norm(values[rows:] - values[:-rows], axis=1)))
 
 
 def _stated_clock(columns: Chosen, first: Cells, options: LogOptions, of_poses: bool) -> Clock:

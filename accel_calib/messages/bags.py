@@ -9,8 +9,6 @@ Correction of a bag: a copy with a corrected Imu topic; all other messages are u
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -38,8 +38,6 @@ replace its measured ones.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property

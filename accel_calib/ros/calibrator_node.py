@@ -243,8 +243,8 @@ class Calibrator:
     def _show_poses(self) -> None:
         """Publish new markers if somebody listens: to make them takes 5 ms."""
         poses, state = self._shown, self.session.state
-        new = next_step(state), state.frame_id or ''
-        if poses is not None and new != self._drawn and self._poses.get_subscription_count():
+        if poses is not None and self._poses.get_subscription_count() and (
+                new := (next_step(state), state.frame_id or '')) != self._drawn:
             self._poses.publish(pose_markers(poses.up, *new))
             self._drawn = new
 

@@ -14,27 +14,23 @@ have no leading slash.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import fields
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from geometry_msgs.msg import Quaternion, TransformStamped
 from rcl_interfaces.msg import (
     FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult)
 from rclpy.exceptions import InvalidParameterValueException
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ..errors import InputError
 from ..geometry import quaternion_of, StaticTransforms
 from ..session import changed, expected, Settings
 from ..table import Floats
-
-if TYPE_CHECKING:
-    from rclpy.node import Node
-    from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 
 def declared(node: Node, kind: type[Settings], *, fixed: bool = True) -> Settings:

@@ -11,8 +11,6 @@ encoding (byte order) is serialized again in the usual encoding and then process
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -22,10 +20,11 @@ import math
 import operator
 import re
 from time import monotonic
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from rclpy.exceptions import InvalidTopicNameException
+from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.validate_topic_name import validate_topic_name
 from sensor_msgs.msg import Imu
@@ -39,9 +38,6 @@ from ..messages import motion_of, output_frame, Rewriter, Triple
 from ..session import Around, BATCH, CalibratorSettings, columns_of, Session
 from ..table import Floats
 from ..text import some
-
-if TYPE_CHECKING:
-    from rclpy.node import Node
 
 _MANY = 30
 """Number of messages from which their array is made and processed after different messages."""

@@ -203,14 +203,15 @@ class LiveCapture:
         rests = [*(each.rest for each in judged), *self.detector.missing]
         own = [each for each in rests if each.start >= self._begun]
         poses = self.poses()
-        lack = np.any([np.isnan(poses[key]) for key in needs if key in poses] or [[False]], axis=0)
-        if np.any(lack) and not np.all(lack):
-            found = (*found, Finding(
-                'note', f'{counted(int(np.sum(lack)), "pose")} without '
-                f'{" or ".join(key for key in needs if key in poses)} left out'))
-            poses = poses.take(~lack)
-        partial = [key for key in (*CONTEXT, *poses.quantities)
-                   if key in poses and np.isnan(poses[key]).any()]
+        holes = {key: np.isnan(poses[key]) for key in (*CONTEXT, *poses.quantities)
+                 if key in poses}
+        lacking = [key for key in needs if np.any(holes.get(key, False))]
+        whole = ~np.any([holes[key] for key in lacking], axis=0)
+        if lacking and np.any(whole):
+            found = (*found, Finding('note', f'{counted(int(np.sum(~whole)), "pose")} without '
+                                     f'{" or ".join(lacking)} left out'))
+            poses = poses.take(whole)
+        partial = [key for key in holes if np.any(np.isnan(poses[key]))]
         return replace(poses.without_columns(*partial),
                        findings=(*found, *account_of(own, self._settings)))
 

@@ -219,9 +219,9 @@ def header(calibration: Calibration, options: Options) -> Made:
         'legendre': [(degree, np.array(next(zone.polynomial for zone in ZONES
                                             if zone.degree == degree))) for degree in degrees],
         'unit': 'm/s^2' if calibration.units.is_si else 'g', 'frame': frame_words(calibration),
-        's': {'middle': made.middle, 'low': made.middle - made.half,
-              'high': made.middle + made.half, 'per_half': 1.0 / made.half,
-              } if made.of_temperature else None}
+        's': made.of_temperature and {
+            'middle': made.middle, 'low': made.middle - made.half,
+            'high': made.middle + made.half, 'per_half': 1.0 / made.half}}
     return Made(values, lambda reading, temperature: (
         made.force(reading, temperature) / calibration.force_per_g), True)
 
