@@ -13,7 +13,7 @@ from accel_calib.refinement import refine
 from faults.sample import sample
 from inside import (
     calibrated_by, common_sensors, FitPlan, Model, MODELS, predict, sensor_force, simulate_poses,
-    spread_directions, unit, with_vector)
+    spread_directions, unit, with_vector, without_knocked)
 import numpy as np
 import pytest
 from shared import changed, G, NATIVE, poses_of, rms
@@ -92,6 +92,24 @@ def test_clean_poses_are_kept_and_a_knocked_pose_is_left_out():
         assert [each.row for each in found.rejected] == [5]
         error, stated = errors(found, model, UP)
         assert np.mean(np.abs(error) < 4.0 * stated) > 0.95
+
+
+def test_a_pose_among_many_is_left_out_from_six_deviations_on():
+    for seed in range(1, 5):
+        poses = tilting((seed, 30), 30)[1]
+        for deviations, rows in ((4.0, []), (6.0, [5])):
+            found = fit_partial(changed(poses, 4, 1.0 + deviations * 3e-4), G)
+            assert [each.row for each in found.rejected] == rows
+
+
+@pytest.mark.parametrize('seed', [4, 5])
+def test_the_variance_is_at_least_the_most_probable_one_and_less_where_the_noise_is_overstated(
+        seed):
+    poses = tilting((seed, 20), 20)[1]
+    under, over = (without_knocked(poses.with_columns(std=poses['std'] * times), np.arange(20),
+                                   common_sensors(), 0.1, 0.25) for times in (0.3, 10.0))
+    assert under.fit.factor >= under.factor > 1.0
+    assert over.fit.factor < over.factor == 1.0
 
 
 def test_result_does_not_depend_on_the_axis_that_points_up():

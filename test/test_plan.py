@@ -62,6 +62,18 @@ def test_the_poses_of_the_plan_name_the_hidden_effect():
     assert after.steps[-1].probabilities['cubic'] > 0.95
 
 
+@pytest.mark.parametrize(('seed', 'size'), [(3, 0.006), (7, 0.01)])
+def test_a_plan_is_made_below_a_probability_of_95_percent_and_ends_there(seed, size):
+    poses = simulated(np.random.default_rng(seed), noise_g=0.003,
+                      cubic=size * np.array([1.0, -0.75, 1.0]))
+    found = refine(poses, G, base='10')
+    largest = max(found.steps[-1].data_probabilities.values())
+    assert largest == pytest.approx(0.95, abs=0.015)
+    expected = [pose.expected for pose in found.plan.poses]
+    assert bool(expected) is (largest < 0.95)
+    assert not expected or max(expected[:-1]) < 0.95 <= expected[-1] < 0.96
+
+
 @pytest.mark.parametrize('seed', range(3))
 def test_what_is_usual_does_not_replace_a_pose_that_would_show_it(seed):
     rng, count = np.random.default_rng(seed), 24

@@ -213,6 +213,15 @@ def test_a_refined_calibration_is_not_replaced_by_an_automatic_fit(readings: Rea
     assert driver.calibration is refined
 
 
+def test_automatic_fits_are_a_minute_apart(readings: Readings) -> None:
+    driver, fits = Driver(auto_fit=True), dict[int, float]()
+    for up in spread_directions(70):
+        driver.feed(readings([up]))
+        fits.setdefault(driver.sensor.fitted_poses, driver.now)
+    _, first, second = fits.values()
+    assert 60.0 <= second - first < 62.0
+
+
 # The stream
 
 

@@ -9,9 +9,9 @@ import math
 from accel_calib.effects import EFFECTS, EmpiricalCurve
 from inside import (
     accepted, beginning, Block, candidates, explored, fitted_state, FoundCurve, grown_curve,
-    is_better_than_walk, less, Linear, linearised, Model, Near, outside_of, Process, process_of,
-    RARE, REFINE_LEVEL, reshaped, rss_beside, search_effects, Set, SIGNIFICANT, simulate_poses,
-    spread_directions, Walk, walk_beside, WORTH)
+    is_better_than_walk, less, Linear, linearised, Model, Near, outside_of, probabilities, Process,
+    process_of, RARE, REFINE_LEVEL, reshaped, rss_beside, search_effects, Set, SIGNIFICANT,
+    simulate_poses, spread_directions, Walk, walk_beside, WORTH)
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -242,6 +242,17 @@ def test_a_reshaped_set_has_all_other_effects_and_the_best_shape():
     shape, = (linear.blocks[each].shape for each in found.blocks
               if linear.blocks[each].effect == 'offset_temperature')
     assert shape == pytest.approx([lag, 0.0], rel=0.3)
+
+
+def test_the_rivals_of_an_effect_of_the_ladder_are_of_the_ladder_and_those_of_others_are_all():
+    names, axes = ['axis_gain', 'cross_axis', 'quadratic', 'cubic'], np.eye(40)
+    columns = np.column_stack([0.96 * axes[0] + 0.28 * other for other in axes[1:5]])
+    noise = np.where(np.arange(40) > 4, np.cos(np.arange(40.0)), 0.0)
+    linear = by_hand(5.0 * columns.sum(axis=1) + noise, columns, names)
+    for block, rivals in ((0, names[:2]), (2, names)):
+        chosen = Set.of(linear, (block,))
+        found = probabilities(*chosen.effects, Near(chosen, linear, None, None))
+        assert sorted(found) == sorted(rivals)
 
 
 def random_walk(count, modes, ratio, rng):

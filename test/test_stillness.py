@@ -362,6 +362,12 @@ def test_repeated_poses_are_kept_merged_or_refused_as_asked(repeated, poses, uni
     assert len(captured(time, scale * reading, units_of(unit), settings).poses) == poses
 
 
+@pytest.mark.parametrize('repeated', ['keep', 'merge', 'refuse'])
+def test_parts_of_a_long_rest_are_not_repeated_poses(repeated):
+    settings = CaptureSettings(repeated=repeated, max_dwell=5.0)
+    assert captured(*still(3, 20.0), settings=settings).poses['orientation'].tolist() == [0] * 4
+
+
 @pytest.mark.parametrize('repeated', ['merge', 'refuse'])
 def test_a_doubtful_pose_does_not_take_the_place_of_a_sure_one(repeated):
     dwells = [replace(each, doubtful=k == 0)

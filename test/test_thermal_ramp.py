@@ -102,6 +102,14 @@ def test_the_degree_and_the_coefficients_are_those_of_the_sensor(truth, degree, 
     assert found.band_mg < 1.0
 
 
+@pytest.mark.parametrize('size_g', [0.9e-3, 1.1e-3])
+def test_a_step_of_less_than_1_mg_is_not_named(size_g):
+    log = ramp(3, LINE, noise_g=0.001)
+    later = (log['time'] > 1000.0)[:, np.newaxis]
+    log = log.with_columns(reading=log.reading + later * size_g * G * np.array([0.6, 0.0, 0.8]))
+    assert ('offset_step' in curve(log).model.effects) is (size_g > 1e-3)
+
+
 @pytest.mark.parametrize('wander_g', [0.0, 3e-4, 1e-3])
 def test_deviations_include_correlated_noise_which_does_not_raise_the_degree(wander_g):
     runs = [curve(ramp(seed, LINE, wander_g=wander_g, rate_hz=2.0))
