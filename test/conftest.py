@@ -33,9 +33,6 @@ from shared import GRAVITY, KNOWN, known, ROOT
 sys.path[:0] = [str(ROOT / 'benchmarks'), str(ROOT / 'docs')]
 """Some tests are the short form of a benchmark, and others check what makes a page."""
 
-UDP = ROOT / 'config' / 'fast_dds_udp.xml'
-"""Profile of Fast DDS with the discovery range of LOCALHOST, and without shared memory."""
-
 collect_ignore_glob = [] if find_spec('rclpy') else ['test_ros_*.py']
 """Without ROS only the other tests run."""
 
@@ -113,19 +110,6 @@ class Bench:
         """Leave DDS and join it again, because it considers killed processes alive for 20 s."""
         self._leave()
         self._join()
-
-    def without_shared_memory(self) -> None:
-        """
-        Let processes that are started from now on use UDP alone.
-
-        A test that kills them needs this. If a process is killed while it writes a message to the
-        shared memory of the bench, it leaves a locked mutex there. After a second, a thread of
-        Fast DDS (2.14.5) replaces this memory. Meanwhile `_leave` may wait for the mutex, and the
-        process of the tests ends with a segmentation fault.
-
-        """
-        self._environment |= {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT',
-                              'FASTRTPS_DEFAULT_PROFILES_FILE': str(UDP)}
 
     def start(self, name: str, **parameters: Any) -> Process:
         """Start a node of the package as a process."""
