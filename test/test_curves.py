@@ -7,8 +7,7 @@ import re
 
 from accel_calib.calibration import fit_poses
 from accel_calib.effects import (
-    CARRIERS, effect_named, EMPIRICAL, EmpiricalCurve, entry_of, formula_of, kind_of, modes_of,
-    VARIABLES)
+    effect_named, EMPIRICAL, EmpiricalCurve, entry_of, formula_of, kind_of)
 from accel_calib.findings import rate
 from accel_calib.refinement import refine
 from accel_calib.report import calibration_page
@@ -45,26 +44,6 @@ def hump(temperature):
 def base_of(poses):
     return beginning(poses, Model({name: np.zeros(3)
                                    for name in ('offset', 'axis_gain', 'cross_axis')}))
-
-
-@pytest.mark.parametrize('variable', VARIABLES)
-@pytest.mark.parametrize(('carrier', 'part'), [
-    *((carrier, '') for carrier in CARRIERS), ('gain', 'z'), ('cross_axis', 'yz')])
-def test_the_text_of_a_curve_is_read_back(carrier, part, variable):
-    modes = tuple(modes_of(variable)[k] for k in (0, 2, -1))
-    curve = EmpiricalCurve(carrier, variable, modes, part)
-    if carrier != {'force': 'offset', 'direction': 'force'}.get(variable, carrier):
-        with pytest.raises(KeyError):
-            effect_named(str(curve))
-        return
-    assert str(curve).startswith(f'empirical-{carrier}.{part}'.rstrip('.'))
-    assert effect_named(str(curve)) == curve
-    assert kind_of(curve) == EMPIRICAL
-    effect = entry_of(curve)
-    parts = 1 if part else len(CARRIERS[carrier])
-    assert len(effect.parameters) == (7 + 11 + 13 if variable == 'direction' else 3 * parts)
-    assert len(set(effect.parameters)) == len(effect.parameters)
-    assert effect.needs == (() if variable in ('force', 'direction') else (variable,))
 
 
 @pytest.mark.parametrize('name', table('no_curves'))

@@ -30,7 +30,7 @@ from accel_calib.errors import InputError
 from accel_calib.fleet import cluster, Input, Options, run, Store
 from accel_calib.logs import write_table
 from accel_calib.stored import read_calibration, read_prior
-from faults.sample import FACTOR, sample
+from faults.sample import sample
 from fleet_case import (
     found_in, OFFSET, page_of, QUICK, rows_of, state_of, write_fleet, write_poses)
 from inside import (
@@ -585,35 +585,6 @@ def test_ctrl_c_interrupts_where_the_program_waits_not_within_dask(client: Any) 
     finally:
         signal.signal(signal.SIGINT, before)
     assert reached == [2]
-
-
-@pytest.mark.skipif(FACTOR == 1, reason='a store takes long to start: make faults')
-def test_recordings_are_read_from_a_store_of_s3(
-        client: Any, recorded: Path, undisturbed: Path, tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch) -> None:
-    server_of = pytest.importorskip('moto.server')
-    s3fs = pytest.importorskip('s3fs')
-    server = server_of.ThreadedMotoServer(ip_address='127.0.0.1', port=0)
-    server.start()
-    try:
-        host, port = server.get_host_and_port()
-        known = {'AWS_ACCESS_KEY_ID': 'key', 'AWS_SECRET_ACCESS_KEY': 'secret',
-                 'AWS_DEFAULT_REGION': 'us-east-1', 'AWS_ENDPOINT_URL': f'http://{host}:{port}'}
-        for name, value in known.items():
-            monkeypatch.setenv(name, value)
-        client.run(lambda: os.environ.update(known))
-        store = s3fs.S3FileSystem(skip_instance_cache=True)
-        store.mkdir('fleet')
-        store.put(f'{recorded}/', 'fleet/recorded/', recursive=True)
-        far = Site(client, 's3://fleet/recorded/robot_*', tmp_path / 'out')
-        assert main(far.on_cluster()) == 0
-        assert main(replace(far, recorded='s3://fleet/nothing/').on_cluster()) == 2
-    finally:
-        server.stop()
-    found, expected = ([[row[key] for key in ('content', 'sensor', 'status', 'offset.x')]
-                        for row in sorted(rows_of(each), key=lambda row: row['recording'])]
-                       for each in (tmp_path / 'out', undisturbed))
-    assert found == expected
 
 
 def test_own_effects_are_known_to_all_workers_and_needed_later(

@@ -19,7 +19,7 @@ from driven import Driver, GRAVITY, Person
 from inside import spread_directions
 import numpy as np
 import pytest
-from shared import run_json, Stored
+from shared import run_json
 
 pytestmark = pytest.mark.usefixtures('home')
 
@@ -133,22 +133,6 @@ def test_axes_of_a_driver_are_named_after_two_rests_and_poses_are_asked_for_as_t
         assert np.array_equal(driver.sensor.guide.axes, axes)
 
 
-@pytest.mark.parametrize('count', [0, 20])
-def test_a_calibration_for_another_start_of_the_node_is_not_set_aside_by_the_next_step(
-        stored: Stored, count: int) -> None:
-    path = stored(unit='native')
-    before = path.read_bytes()
-    driver = Driver(calibration_file=str(path))
-    person = Person(driver, reading())
-    for up in spread_directions(count):
-        person.rest(up)
-    assert person.follow(seconds=60.0) == 'restart'
-    assert person.called == []
-    assert path.read_bytes() == before
-    driver.ask('reset')
-    assert next_step(driver.session.state).kind == 'poses'
-
-
 def test_the_correction_and_the_range_of_the_calibration_come_before_done() -> None:
     driver = Driver(sensor='warm')
     person = Person(driver, lambda up, warm: reading()(up, warm) + 1e-3 * (warm - 25.0),
@@ -163,19 +147,6 @@ def test_the_correction_and_the_range_of_the_calibration_come_before_done() -> N
     action = next_step(driver.session.state)
     assert (action.kind, action.command) == ('poses', 'refine')
     assert conditions(driver.session.state)[0].level == 'USABLE'
-
-
-def test_bursts_of_absurd_readings_are_said_while_they_last_and_only_counted_then() -> None:
-    driver = Driver(sensor='bursts')
-    person = Person(driver, reading())
-    person.follow()
-    driver.feed(np.full((10, 3), np.nan))
-    assert conditions(driver.session.state)[0].kind == 'not_finite'
-    assert driver.finding('stream').level == 'USABLE'
-    person.rest(person.flat, 8.0)
-    assert next_step(driver.session.state).kind == 'done'
-    assert driver.finding('stream').level == 'GOOD'
-    assert dict(health_figures(driver.session.state))['readings not finite'] == '10'
 
 
 def test_a_calibration_that_cannot_be_stored_leaves_no_file_and_is_asked_for_until_it_is(
@@ -216,19 +187,6 @@ def test_an_assumed_temperature_is_that_of_messages_and_mounting_and_not_of_drif
     force = driver.sensor.force_of(tuple(reading), driver.session.state.context)
     np.testing.assert_allclose(gravity / GRAVITY, force, atol=1e-3)
     np.testing.assert_allclose(gravity[:2], 0.0, atol=1e-2)
-
-
-def test_where_no_ros_runs_options_are_named_instead_of_parameters() -> None:
-    for scale, words in ((1.0 / GRAVITY, '--units g'), (1.0, '--still-std-max 0.')):
-        driver = Driver()
-        driver.session.change(surroundings=Surroundings(publishers=None))
-        person = Person(driver, reading(scale=scale), shaken=0.04 * scale)
-        person.rest(person.flat)
-        person.steps.append('')
-        person.rest(person.flat, 12.0)
-        text = next_step(driver.session.state).text
-        assert f'start again with {words}' in text
-        driver.session.close()
 
 
 def test_no_step_is_named_while_the_rating_is_being_computed() -> None:
@@ -366,42 +324,6 @@ def test_each_fit_refinement_and_levelling_is_reported_as_on_the_command_line(
     logged = driver.logged('info')
     assert logged.count(f'stored in {store.calibration}') >= len(answers)
     assert figures(driver)['mounting']['urdf'] in logged
-
-
-def test_an_offered_calibration_waits_for_save_and_is_reported_as_not_in_use() -> None:
-    driver, person = followed(confirm=True)
-    assert list(dict.fromkeys(person.steps)) == ['poses', 'fit', 'accept', 'level', 'done']
-    person.rest(person.flat, 4.0)
-    for command in ('calibrate_at_rest', 'set_level'):
-        driver.ask(command)
-        assert figures(driver)['in_use'] is False
-        assert figures(driver)['next']['command'] == '~/save'
-    driver.ask('save')
-    assert figures(driver)['in_use'] is True
-
-
-@pytest.mark.parametrize(('command', 'words'), [
-    ('set_level', 'correcting the mounting alone, offset and gain are not calibrated'),
-    ('calibrate_at_rest', 'correcting, with a calibration of a part of the orientations')])
-def test_a_mounting_alone_is_reported(command: str, words: str) -> None:
-    driver = Driver(auto_capture=False)
-    Person(driver, healthy).rest([0.1, 0.0, 1.0], 4.0)
-    driver.ask(command)
-    assert figures(driver)['rotation'][2] != [0.0, 0.0, 1.0]
-    assert dict(health_figures(driver.session.state))['state'] == words
-    assert not driver.logged('error')
-
-
-def test_an_offer_that_is_discarded_names_what_is_in_use() -> None:
-    driver = Driver(auto_capture=False, confirm=True)
-    Person(driver, healthy).rest([0.0, 0.0, 1.0], 4.0)
-    for saves, words in ((False, 'there is no other one'), (True, 'the one in use is unchanged')):
-        driver.ask('calibrate_at_rest')
-        assert enable(driver.session, True).endswith('call ~/save to use the one that waits')
-        if saves:
-            driver.ask('save')
-            driver.ask('set_level')
-        assert driver.ask('undo').endswith(words)
 
 
 def test_slow_motion_by_hand_is_named_while_a_pose_is_waited_for() -> None:

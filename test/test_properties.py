@@ -4,10 +4,9 @@
 """Properties that hold for any sensor and any poses, tried on random cases."""
 
 
-import accel_calib as ac
 from accel_calib.calibration import Calibration, fit_poses
 from accel_calib.effects import EFFECTS, EmpiricalCurve, modes_of, VARIABLES
-from accel_calib.errors import InputError, RefusedFitError
+from accel_calib.errors import RefusedFitError
 from accel_calib.finding import has
 from accel_calib.findings import outlook, rate
 from accel_calib.table import Poses
@@ -265,14 +264,3 @@ def test_two_poses_that_alone_check_each_other_are_both_named(seed, wrong, knock
     assert {16, 17} <= {*doubt.rows}
     assert rate(found).name != 'GOOD'
     assert error_of(found, sensor) <= SURE * uncertainty_g(found)
-
-
-@tried(30)
-@given(errors=ERRORS, count=COUNTS, seed=SEEDS, place=st.floats(0.0, 0.99),
-       axis=st.integers(0, 2), value=st.sampled_from([np.nan, np.inf, -np.inf]))
-def test_a_number_that_is_not_finite_is_refused_with_its_row(
-        errors, count, seed, place, axis, value):
-    readings = poses_of(errors, count, seed, (0.0, 0.0, 0.0)).reading.copy()
-    readings[int(place * count), axis] = value
-    with pytest.raises(InputError, match=f'row {int(place * count) + 1} of ax, ay, az'):
-        ac.fit(readings, units='g', model='10')

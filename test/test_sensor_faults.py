@@ -22,12 +22,3 @@ def test_a_fault_is_named_and_never_calibrated_as_it_is(
     assert found['calibrated'] == (FAULTS[name].right and not signs_of_messages) or (
         name == 'clipped')  # the poses inside the limit may be enough
     assert found['false'] == 0 or name != 'none'
-
-
-@pytest.mark.parametrize('surface', ['CSV', 'node'])
-def test_the_few_poses_inside_the_limit_of_a_sensor_are_not_taken_for_a_calibration(
-        surface: str, tmp_path: Path) -> None:
-    found = counted('clipped', surface, 5, 79, tmp_path)
-    assert found['named'] == 5
-    assert 0 < found['calibrated'] < 5
-    assert found['wrong'] == 0

@@ -5,6 +5,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+import json
 from pathlib import Path
 import struct
 from typing import Any
@@ -13,7 +14,7 @@ import accel_calib as ac
 from accel_calib.calibration import Calibration, fit_poses, level, SampleNoise
 from accel_calib.logs import joined, layout_of
 from accel_calib.messages import corrected, motion_of, output_frame, Rewriter
-from accel_calib.session import diagnostics, progress
+from accel_calib.session import diagnostics, progress, Surroundings
 from accel_calib.units import units_of
 from driven import Driver
 from golden.figures import attempt, of_next_pose, those
@@ -64,6 +65,10 @@ class _Driver(Driver):
         self.session.tick()
         self.handle()
 
+    def surround(self, **given: Any) -> None:
+        """Change what is known of the surroundings."""
+        self.session.change(surroundings=Surroundings(**given))
+
     def edit(self, old: str, new: str) -> None:
         """Change the file of the calibration."""
         path = Path('c.yaml')
@@ -90,6 +95,10 @@ class _Driver(Driver):
                 self.session.sensor.live.poses(),
                 drift and {'covariance': drift.calibration.covariance, **those(
                     drift, 'repeats temperatures rests count scatter change since without')}]
+
+    def reports(self) -> Any:
+        """Return the results as JSON."""
+        return [json.loads(text) for text in self.results]
 
     def lines(self) -> Any:
         return [f'{each.severity}: {each.words}' for each in self.log]
