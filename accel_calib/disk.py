@@ -100,20 +100,22 @@ def _replacing(target: Path) -> Iterator[BinaryIO]:
     """Yield a new file that replaces the target at the end; it is removed after an error."""
     old = replaceable(target)
     temporary = target.with_name(f'.{target.name[:_LONGEST_NAME]}.{secrets.token_hex(8)}{_SUFFIX}')
-    handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666)
     try:
-        with open(handle, 'wb') as file:
-            if old is not None:
-                with suppress(PermissionError):  # the owner stays, if the user may set it
-                    os.fchown(handle, old.st_uid, old.st_gid)
-                os.fchmod(handle, stat.S_IMODE(old.st_mode))
-            yield file
-        temporary.replace(target)
+        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666)
+        try:
+            with open(handle, 'wb') as file:
+                if old is not None:
+                    with suppress(PermissionError):  # the owner stays, if the user may set it
+                        os.fchown(handle, old.st_uid, old.st_gid)
+                    os.fchmod(handle, stat.S_IMODE(old.st_mode))
+                yield file
+            temporary.replace(target)
+        finally:
+            temporary.unlink(missing_ok=True)
     except OSError as err:
-        err.filename = err.filename or str(target)
+        if str(err.filename or temporary) == str(temporary):
+            err.filename = str(target)
         raise
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def replaceable(path: Path) -> os.stat_result | None:

@@ -11,7 +11,9 @@ import shutil
 import sys
 
 import accel_calib as ac
+from accel_calib.disk import write_atomically
 from accel_calib.errors import RefusedFitError
+from accel_calib.logs import write_table
 from accel_calib.stillness import CaptureSettings
 from accel_calib.stored import read_calibration
 from inside import (
@@ -369,6 +371,19 @@ def test_a_page_or_calibration_that_does_not_fit_on_the_disk_is_one_line(
     assert 'No space left' in (done.stderr if status else done.stdout)
     assert [each.name for each in copy.iterdir()] == left
     assert all(read_calibration(copy / name).name for name in left)
+
+
+def test_an_error_of_the_disk_names_the_file_that_is_asked_for(tmp_path):
+    with pytest.raises(FileNotFoundError) as error:  # as on a disk that is read-only
+        write_atomically(Path('/proc/c.yaml'), lambda file: None)
+    assert error.value.filename == '/proc/c.yaml'
+    poses, disk = tmp_path / 'poses.csv', tmp_path / 'disk'
+    write_table(poses, ac.simulate({'quadratic': 0.01}, poses=24))
+    done, copy = run_on_small_disk(disk, 64, 'report', poses, '-o', tmp_path / 'page.html',
+                                   '--figures', disk / 'figures')
+    assert f'report: {disk}/figures/' in done.stderr
+    assert all(each.read_bytes().endswith((b'</svg>\n', b'IEND\xaeB`\x82'))
+               for each in (copy / 'figures').iterdir())
 
 
 # The plan of a fit beside a calibration that is in use

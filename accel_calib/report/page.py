@@ -23,6 +23,7 @@ standard deviations follow from the covariance of the calibration.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ from .sheet import (
     ACCENT, add_band, AFTER, AXIS_COLOURS, BAND, BEFORE, Drawing, drawn, EDGE, FAINT,
     HEIGHT_INCHES, INK, legend_below, Mark, Marks, page, PAPER, styled)
 from ..calibration import Calibration, Curve, Verification
+from ..disk import write_atomically
 from ..effects import (
     AXES, EffectKey, EmpiricalCurve, entry_of, parameter_names, REFERENCE_TEMPERATURE, value_unit,
     variable_words, with_vector)
@@ -323,8 +325,9 @@ def write_figures(folder: Path, result: Refinement) -> list[Path]:
     for drawing in all_drawings(result):
         for suffix in ('svg', 'png'):
             paths.append(folder / f'{drawing.name}.{suffix}')
+            save = partial(drawing.figure.savefig, format=suffix, dpi=160, facecolor='white')
             with styled():
-                drawing.figure.savefig(paths[-1], dpi=160, facecolor='white')
+                write_atomically(paths[-1], lambda file, save=save: save(file.buffer))
     return paths
 
 
