@@ -239,7 +239,19 @@ def test_rate_and_faults_of_the_stamps_follow_the_last_seconds() -> None:
     assert 'out of order' in statistics_of(*(each[::-1] for each in times)).stamp_fault
     again = [*times, *(each + 9.0 for each in times)]  # a bag is played again
     assert not statistics_of(*times, *again).stamp_fault
+    played = [*times, *(each + 9.0 - 36.0 * (each[0] > 8.0) for each in times)]
+    for jumped in ([each + 1e5 * (each[0] > 7.0) for each in times], played[8:]):
+        assert not statistics_of(*jumped).stamp_fault
+    assert '1e3 times' in statistics_of(*(1e3 * each for each in times)).stamp_fault
     assert statistics_of(*times[:1]).rate == 0.0
+    clock = [0.0]
+    gap, slow = (StreamStatistics(lambda: clock[0]) for _ in range(2))
+    for clock[0] in (0.0, 0.3, 60.0, 60.3):  # the mean over a silence is no rate
+        gap.add(rows_of(times[0] + clock[0], [1.0, 1.0, 1.0]), clock[0])
+    assert gap.rate == pytest.approx(200.0)
+    for clock[0] in range(9):  # a message per batch does not show the noise
+        slow.add(rows_of([clock[0]], [1.0, 1.0, 1.0 + 1e-3 * (clock[0] % 2)]), clock[0])
+    assert slow.turn_rate(0.1, 1.0) == 0.0
 
 
 @pytest.mark.parametrize(('settings', 'words'), table('contradicting_settings'))

@@ -177,12 +177,12 @@ def test_a_sensor_that_is_tilted_and_tilted_back_in_a_short_dwell_is_not_still(s
     assert_all_found(captured(time, moved), [*truth[:3], *truth[4:]])
 
 
-def rests_found(excess, noise, turning=0.0, gyro=True):
+def rests_found(excess, noise, turning=0.0, gyro=True, value=None):
     """
     Return which rests of 3 s are poses.
 
     The gyro reads the excess of each about y in addition to its bias, and the reading turns at
-    the share `turning` of it [°/s].
+    the share `turning` of it [°/s]. In three rests it sends one `value`, unless that is None.
 
     """
     rng, seconds = np.random.default_rng(3), np.arange(300) / 100.0
@@ -193,7 +193,10 @@ def rests_found(excess, noise, turning=0.0, gyro=True):
         readings += [force + noise * rng.normal(size=(300, 3)), rng.normal(size=(100, 3))]
         rates += [[0.02, -0.01 + np.radians(each), 0.03] + 1e-4 * rng.normal(size=(300, 3)),
                   rng.normal(size=(100, 3))]
-    reading, known = np.concatenate(readings), {'rate': np.concatenate(rates)} if gyro else {}
+    reading, rate = np.concatenate(readings), np.concatenate(rates)
+    if value is not None:
+        rate[800:2050] = value
+    known = {'rate': rate} if gyro else {}
     poses = captured(np.arange(len(reading)) / 100.0, reading, **known).poses
     return (poses['time'] // 4.0).tolist()
 
@@ -204,6 +207,8 @@ def test_a_gyro_decides_whether_a_short_noisy_rest_turns_slowly():
     assert rests_found(rests, 0.005, gyro=False) == list(range(8))
     assert rests_found(rests, 0.05) == list(range(8))
     assert rests_found(turned_one, 0.05, turning=1.0) == [0, 1, 2, 3, 4, 6, 7]
+    for value in (0.0, 0.0123, -0.7):  # a driver that gets no rates for a while
+        assert {0, 1, 5, 6, 7} <= {*rests_found(rests, 0.005, value=value)}
 
 
 def test_a_gyro_that_says_turning_overrules_a_steady_reading():

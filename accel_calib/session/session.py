@@ -105,6 +105,8 @@ class Session(Holder):
     def _report_conditions(self) -> None:
         """Log what is wrong, what is over, and what a pose or an effect would need."""
         state, statistics = self.state, self.state.statistics
+        if statistics.age <= SILENT and not statistics.rate:
+            return  # what is over can be said with the rate alone
         now = {(each.kind, each.about): each.text for each in conditions(state)
                if each.level != 'GOOD' and each.kind not in APART}
         waits = not statistics.messages and not state.surroundings.mismatches

@@ -104,6 +104,8 @@ class StreamStatistics:
         steps = np.diff(stamps, prepend=self.stamp)  # the first step of a stream is NaN
         readings = rows[:, 1:4]
         self.spread = float(np.max(readings.std(axis=0)))
+        if arrived - self.arrived > SILENT:  # the rate is that since the stream is back
+            self._batches.clear()
         self._batches.append(_Batch(
             arrived, float(stamps[-1]), readings.mean(axis=0),
             float(np.linalg.norm(readings, axis=1).mean()), self.spread, len(rows),
@@ -118,11 +120,12 @@ class StreamStatistics:
     def turn_rate(self, threshold: float, expected: float) -> float:
         """Return the rate of a slow turn without shaking [°/s]; 0 if there is none."""
         track = [each for each in self._batches if 0.0 <= self.stamp - each.stamp <= _HELD]
-        if not track or max(each.spread for each in track) >= threshold:
+        spread = max((each.spread for each in track), default=0.0)
+        if not 0.0 < spread < threshold:  # 0: single messages do not show the noise
             return 0.0
         seconds = self.stamp - track[0].stamp
         way = float(np.linalg.norm(np.ptp([each.mean for each in track], axis=0)))
-        noise = max(each.spread / math.sqrt(each.messages) for each in track)
+        noise = spread / math.sqrt(min(each.messages for each in track))
         rate = math.degrees(way / expected) / seconds if seconds > 0.8 * _HELD else 0.0
         return rate if rate > _TURNS and way > _BEYOND_NOISE * noise else 0.0
 
@@ -179,8 +182,8 @@ class StreamStatistics:
         if messages < _FEWEST:
             return ''
         driver = 'expected the time of each reading: set header.stamp in the driver'
-        first, last = self._batches[0], self._batches[-1]
-        stamped, arrived = last.stamp - first.stamp, last.arrived - first.arrived
+        steps = np.diff([(each.stamp, each.arrived) for each in self._batches], axis=0)
+        stamped, arrived = steps[np.argsort(np.abs(steps[:, 0]))][:-1].sum(axis=0)  # a jump is one
         factor = abs(stamped) / arrived if arrived > 0.5 * _SPAN else 1.0
         return next((f'the stamps {words}' for holds, words in (
             (zero > _FEW * messages, f'are zero, {driver}'),

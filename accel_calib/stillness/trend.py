@@ -62,6 +62,9 @@ _BATCH = 4096
 _CORRELATION_MAX = 0.9
 _TINY = 1e-300
 
+_ROUND_OFF = 1e-13
+"""Ratio of a variance to the mean square about the origin below which it is a rounding error."""
+
 
 def sliding(fold: np.ufunc, values: Floats, length: int) -> Floats:
     """Return the sums (`numpy.add`) or maxima over windows of this length along the last axis."""
@@ -86,8 +89,9 @@ def window_figures(sums: Records, origin: Floats) -> tuple[Floats, Floats]:
     inside, total, power = (sliding(np.add, each, CHUNKS_PER_WINDOW)
                             for each in (sums['count'], first, second))
     mean = total / inside
-    variance = np.maximum(power - total * mean, 0.0) / (inside - 1.0)
-    return mean + origin[:, np.newaxis], variance
+    square = power - total * mean
+    return mean + origin[:, np.newaxis], np.where(
+        square <= _ROUND_OFF * power, 0.0, square) / (inside - 1.0)
 
 
 def oscillation(values: Floats, length: int, index: Indices) -> Floats:
