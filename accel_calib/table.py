@@ -30,6 +30,9 @@ ABOUT = ('units', 'sensor', 'autopilot')
 LARGEST = 1e30
 """Larger numbers are damage. The products of smaller ones do not overflow."""
 
+_LIMITS = {'temperature': (-100.0, 250.0, 'from -100 to 250 °C')}
+"""Ranges of values, and their words: no sensor works beyond, and -999 or -127 mean no value."""
+
 _NUMBERS = range(-2**31, 2**32)
 """Numbers of an autopilot: those of 32 bits, with or without a sign."""
 
@@ -383,27 +386,29 @@ def numbered(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
     return np.arange(1, len(columns['reading']) + 1)
 
 
-def check_values(columns: Mapping[str, NDArray[Any]], source: str, *, partial: bool = False
-                 ) -> None:
+def check_values(columns: Mapping[str, NDArray[Any]], source: str,
+                 rows: NDArray[np.int64] | None = None, *, partial: bool = False) -> None:
     """
     Check values; InputError if one is not finite, or none that its column can hold.
 
-    `partial`: those of `CONTEXT` can be NaN.
+    `rows` are the numbers of the rows, by default from 1; `partial`: those of `CONTEXT` can be
+    NaN.
 
     """
     for key, values in columns.items():
-        if partial and key in CONTEXT:
-            values = np.where(np.isnan(values), 0.0, values)
-        if key in COLUMNS and key != 'label' and not np.all(np.abs(values) < LARGEST):
-            by_row = values.reshape(len(values), -1)
-            sound = np.abs(by_row) < LARGEST
+        if key not in COLUMNS or key == 'label':
+            continue
+        by_row = values.reshape(len(values), -1)
+        low, high, words = _LIMITS.get(key, (-LARGEST, LARGEST, f'below {LARGEST:g}'))
+        sound = (low < by_row) & (by_row < high) | (partial and key in CONTEXT) & np.isnan(by_row)
+        if not np.all(sound):
             row = int(np.argmin(sound.all(axis=1)))
             number = float(by_row[row][~sound[row]][0])
             what = (f'the number {number:.3g}' if np.isfinite(number) else
                     'a number that is not finite')
-            raise InputError(f'{source}: row {row + 1} of {", ".join(COLUMNS[key].names)} holds '
-                             f'{what}, expected finite numbers below {LARGEST:g}',
-                             'correct the row or remove it')
+            raise InputError(f'{source}: row {row + 1 if rows is None else rows[row]} of '
+                             f'{", ".join(COLUMNS[key].names)} holds {what}, expected finite '
+                             f'numbers {words}', 'correct the row or remove it')
     if 'count' in columns and not np.all(columns['count'] > 0):
         raise InputError(f'{source}: column count holds numbers that are not above 0, expected '
                          'positive numbers', 'enter the number of samples of each pose')

@@ -180,13 +180,16 @@ def test_logs_of_others_become_poses(name: str, poses: int, tmp_path: Path,
     assert made['poses'] == poses
 
 
-@pytest.mark.parametrize('column', ['temperature', 'supply_voltage', 'humidity'])
-def test_a_column_with_holes_is_the_next_step_where_no_effect_explains(column, tmp_path, capsys):
+@pytest.mark.parametrize(('column', 'hole'), [
+    ('temperature', ''), ('supply_voltage', ''), ('humidity', ''), ('temperature', 'nan'),
+    ('humidity', 'NaN')])
+def test_a_column_with_holes_is_the_next_step_where_no_effect_explains(
+        column, hole, tmp_path, capsys):
     rng = np.random.default_rng(6)
     other, mean = rng.uniform(-1.0, 1.0, 24), G * spread_directions(24)[rng.permutation(24)]
     mean = mean + 0.2 * np.outer(other, [1.0, -1.0, 0.5]) + 0.003 * rng.normal(size=(24, 3))
     rows = rows_of(mean, 20.0 + other, np.full((24, 3), 0.03), np.full(24, 100))
-    rows[7][3] = ''
+    rows[7][3] = hole
     path = write(tmp_path, text_of(rows, f'ax,ay,az,{column},std_x,std_y,std_z,count'))
     _, made = run_json(capsys, 'refine', path)
     assert made['next']['text'].startswith(f'fill in the cells of {column}')
@@ -217,6 +220,34 @@ def test_a_pose_table_has_its_noise_and_times_with_readings_of_any_name_and_unit
             rows = rows_of(scale * 8.0 * np.arange(24), G * up)
             poses = read_poses(write(tmp_path, text_of(rows, f'time,{name}'), 'poses.csv'))
             np.testing.assert_allclose(np.diff(poses['time']), 8.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize(('header', 'rate_hz', 'parts'), [
+    ('secs,nsecs', 100.0, 10 ** 9), ('Time,ms', 90.0, 1000), ('sec,usec', 1000.0, 10 ** 6),
+    ('Uhrzeit', 25.0, 1)])
+def test_whole_seconds_and_their_parts_are_one_clock(tmp_path, header, rate_hz, parts):
+    made = samples(8)
+    ticks = np.round(parts * (1769000000.0 + np.arange(len(made)) / rate_hz)).astype(np.int64)
+    whole = [*map(str, ticks // parts)]
+    if header[0] in 'TU':
+        whole = np.datetime_as_string((ticks // parts).astype('M8[s]'), timezone='UTC')
+        whole = [each[11:19] for each in whole]
+    rows = [[one, *([str(part)] if parts > 1 else []), *row] for one, part, row in zip(
+        whole, (ticks % parts).tolist(), rows_of(made.reading), strict=True)]
+    log = read_log(write(tmp_path, text_of(rows, f'{header},accX,accY,accZ')))
+    assert np.mean(np.diff(log.table['time'])) == pytest.approx(1.0 / rate_hz, rel=1e-3)
+    assert f'{header.replace(",", " + ")}' in log.read_as
+    assert f'({rate_hz:.3g} Hz)' in log.read_as
+
+
+def test_a_wrong_number_is_named_by_its_row_and_no_temperature_is_beyond_a_sensor(tmp_path):
+    block = ''.join(f'{k / 100},0,0,9.8,20\n' for k in range(65540))
+    for row, fault, what in ((65540, '1e30,0,9.8,20', 'ax, ay, az holds the number 1e'),
+                             (3, '0,0,9.8,-127', 'temperature holds the number -127, expected')):
+        lines = block.splitlines(keepends=True)
+        lines[row - 1] = f'{row / 100 - 0.01},{fault}\n'
+        with pytest.raises(InputError, match=f'row {row} of {what}'):
+            read_log(write(tmp_path, ''.join(['time,ax,ay,az,temperature\n', *lines])))
 
 
 def test_an_orientation_is_a_whole_number(tmp_path):

@@ -32,8 +32,8 @@ from ..table import COLUMNS, CONTEXT, Floats, quantity_key
 from ..text import some
 from ..units import STANDARD_GRAVITY, UnitName
 
-FRACTION = 'time_ns'
-"""Key of a column with the nanoseconds of a time in whole seconds."""
+FRACTION = 'time_fraction'
+"""Key of a column with the part of a second beside a time in whole seconds."""
 
 BY_ORDER: Mapping[int, tuple[str, ...]] = {
     3: READING, 4: ('time', *READING), 5: ('time', *READING, 'temperature'),
@@ -286,6 +286,11 @@ def is_number(text: str) -> bool:
     return _NUMBER.fullmatch(text) is not None and math.isfinite(float(text))
 
 
+def is_filled(cell: str) -> bool:
+    """Return whether a cell is neither empty nor NaN, as programs write one without a number."""
+    return cell.casefold() not in ('', 'nan')
+
+
 def is_clock(text: str) -> bool:
     """Return whether a text is a date with a time, or a time of the day."""
     return CLOCK.fullmatch(text) is not None
@@ -336,7 +341,7 @@ def choose_columns(layout: TextLayout, options: LogOptions) -> Chosen:
         if (k not in used and known.quantity in {'', *sources} - {'reading', 'rate', 'time'}
                 and bare_name(name) not in COUNTERS and COMPUTED_WORDS.isdisjoint(known.group)
                 and quantity_key(name)
-                and _are_numbers(list(filter(None, cells)) or cells if of_poses else cells)):
+                and _are_numbers(list(filter(is_filled, cells)) or cells if of_poses else cells)):
             quantities.setdefault(quantity_key(name), k)
     return Chosen(
         layout=layout, sources=sources, maker=maker, needed=tuple(sorted(needed - context)),
@@ -536,10 +541,22 @@ def counter_of(layout: TextLayout) -> int | None:
 
 
 def _fraction(layout: TextLayout, best: int) -> dict[str, int]:
-    """Return the column of the nanoseconds beside whole seconds, as ROS stamps have it."""
-    known = meaning(layout.header[best])
-    if unit_of('time', known.unit) == ('s', 1.0):
-        for k, other in columns_named('time', layout.header).items():
-            if other.group == known.group and unit_of('time', other.unit) == ('ns', 1e-9):
-                return {FRACTION: k}
+    """Return the column of the part of a second beside whole seconds, such as that of ROS."""
+    header, cells = layout.header, layout.first(best)
+    known = meaning(header[best])
+    clocks = [*map(CLOCK.fullmatch, cells)]
+    if not (all(match and not match[5] for match in clocks) or (
+            unit_of('time', known.unit) == ('s', 1.0) and _in_range(cells, 1.0, math.inf))):
+        return {}
+    for k, other in columns_named('time', header).items():
+        unit = unit_of('time', other.unit)
+        if (unit is not None and unit[1] < 1.0 and {*WORDS['time']}.issuperset(
+                {*known.group} ^ {*other.group}) and _in_range(layout.first(k), unit[1], 1.0)):
+            return {FRACTION: k}
     return {}
+
+
+def _in_range(cells: Sequence[str], unit: float, limit: float) -> bool:
+    """Return whether cells are whole numbers of a unit, from 0 to a limit."""
+    return all(is_number(cell) and float(cell) % 1.0 == 0.0 and 0.0 <= float(cell) * unit < limit
+               for cell in cells)

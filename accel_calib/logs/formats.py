@@ -117,7 +117,7 @@ def _bag(_: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
 @contextmanager
 def _flight(known: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
     recording, read_as, notes = known.read(path, options.topic, options.instance)
-    check_values(recording.columns, str(path))
+    check_values(recording.columns, str(path), recording.row)
     units = units_of('m/s2', options.gravity)
     if options.units not in ('', units.name):
         raise InputError(f'{path} is in {units.name}, but --units is {options.units}',

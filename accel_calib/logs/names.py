@@ -47,7 +47,7 @@ _WORDS = {
     'rate': 'g gy gyr gyro gyroscope gyroadc omega w angvel angularvelocity angularrate '
             'rotationrate rotrate',
     'time': 'time timestamp timestamps t ts stamp clock date datetime epoch gpst elapsed millis '
-            'micros uptime zeit temps tiempo tempo',
+            'micros uptime zeit uhrzeit temps heure tiempo hora tempo',
     'temperature': 'temperature temp tmp temperatur temperatura',
     'supply_voltage': 'vdd vcc supply'}
 WORDS: Mapping[str, tuple[str, ...]] = {key: tuple(text.split()) for key, text in _WORDS.items()}

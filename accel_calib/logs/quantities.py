@@ -156,7 +156,7 @@ class Quantities:
         columns |= {key: cells.numbers[k] for key, k in self.chosen.quantities.items()}
         if self.rate_hz is not None:
             columns['time'] = (cells.row - 1) / self.rate_hz
-        check_values(columns, source, partial=partial)
+        check_values(columns, source, cells.row, partial=partial)
         return columns, cells.row
 
     def of_instance(self, cells: Cells) -> Cells:

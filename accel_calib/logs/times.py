@@ -16,7 +16,7 @@ Dates are those of ISO 8601, ``2026-01-31T12:00:00.250Z``, with a blank for the 
 """
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from functools import lru_cache
 import math
@@ -123,12 +123,9 @@ class Clock:
     def seconds(self, cells: Cells) -> Floats:
         """Return the times of a block as they are stated [s]."""
         columns = self.columns
-        if columns.dates:
-            return _seconds_of(cells.texts[columns.dates[0]], columns.layout.path, cells.row)
-        seconds = columns.numbers(cells, 'time')[:, 0] * self.scale
-        if FRACTION in columns.sources:
-            return seconds + 1e-9 * columns.numbers(cells, FRACTION)[:, 0]
-        return seconds
+        seconds = (_seconds_of(cells.texts[columns.dates[0]], columns.layout.path, cells.row)
+                   if columns.dates else columns.numbers(cells, 'time')[:, 0] * self.scale)
+        return seconds + _fraction_of(columns, cells)
 
     def continued(self, cells: Cells) -> Floats:
         """Return the times of the next block, which go on where the counter starts again [s]."""
@@ -158,17 +155,28 @@ class Clock:
 
 def clock_of(columns: Chosen, first: Cells, options: LogOptions, *, of_poses: bool) -> Clock:
     """Return the clock of a log with times, from its first block of samples or poses."""
+    if np.any(_fraction_of(columns, first) >= 1.0):  # it is a clock of its own
+        own = {**columns.sources, 'time': columns.sources[FRACTION], FRACTION: ()}
+        columns = replace(columns, sources=own, dates=())
     clock = _stated_clock(columns, first, options, of_poses)
-    steps = np.diff(clock.seconds(first))
+    seconds = clock.seconds(first)
+    steps = np.diff(seconds)
     moving = steps[steps != 0.0]
     clock.newest_first = len(moving) > 1 and bool(np.mean(moving < 0.0) > _REVERSED)
     if len(moving) > 1 and len(steps) >= _COARSE_ROWS * len(moving):
         interval = float(np.median(np.abs(moving)))
         if interval > _COARSE_S:
-            ends = np.flatnonzero(steps)
-            rows = float(ends[-1] - ends[0]) / (len(ends) - 1)
-            clock.interval, clock.period = interval, interval / rows
+            clock.interval, clock.period = interval, _step_of(seconds)
     return clock
+
+
+def _fraction_of(columns: Chosen, cells: Cells) -> Floats:
+    """Return the (n,) parts of a second that a column has beside whole seconds [s], or 0."""
+    fraction = np.zeros(len(cells.row))
+    for k in columns.sources.get(FRACTION, ()):
+        _, factor = unit_of('time', columns.layout.unit(k)) or ('', 0.0)
+        fraction += factor * cells.numbers[k]
+    return fraction
 
 
 def check_order(time: Floats, reading: Floats, source: str) -> None:
@@ -203,6 +211,8 @@ def _stated_clock(columns: Chosen, first: Cells, options: LogOptions, of_poses: 
     """Return the clock with the unit that is stated, or found from the rate."""
     (column,), layout = columns.sources['time'], columns.layout
     name, rate_hz = layout.name(column), options.rate or layout.rate_hz
+    named = ' + '.join([f'column {name}' if name.isdecimal() else name,
+                        *map(layout.name, columns.sources.get(FRACTION, ()))])
     if rate_hz is not None and bare_name(name) in COUNTERS:
         return Clock(columns, 1.0 / rate_hz, tuple(2.0**bits / rate_hz for bits in (8, 16, 32)),
                      f'{name} at {rate_hz:g} Hz (stated) -> s')
@@ -215,7 +225,7 @@ def _stated_clock(columns: Chosen, first: Cells, options: LogOptions, of_poses: 
         step = _step_of(Clock(columns).seconds(first))
         rate = f' ({1.0 / step:.3g} Hz)' if step > 0.0 else ''
         return Clock(columns, periods=() if dated else (_DAY_S,), words=(
-            f'{name}: {"dates" if dated else "times of the day"}{rate} -> s'))
+            f'{named}: {"dates" if dated else "times of the day"}{rate} -> s'))
     stamps = columns.numbers(first, 'time')[:, 0]
     back = np.count_nonzero(np.diff(stamps) < 0.0)
     forth = np.count_nonzero(np.diff(stamps) > 0.0)
@@ -226,8 +236,7 @@ def _stated_clock(columns: Chosen, first: Cells, options: LogOptions, of_poses: 
                          'add a header line, or name the columns with --columns ax=1,ay=2,az=3')
     unit = _unit_of_time(columns, first, stamps, of_poses)
     scale = {**_UNITS, _TICK: 1e-4}[unit]
-    step = scale * _step_of(stamps)
-    named = f'column {name}' if name.isdecimal() else name
+    step = _step_of(Clock(columns, scale).seconds(first))
     rate = f' ({1.0 / step:.3g} Hz)' if step > 0.0 else ''
     words = f'{named} in {unit}{rate}{"" if unit == "s" else " -> s"}'
     agrees = not layout.rate_hz or not step > 0.0 or any(
@@ -315,7 +324,10 @@ def _step_of(stamps: Floats) -> float:
     if middle > 0.0:  # the mean, because stamps can be rounded, but without interruptions
         usual = steps[(steps >= 0.0) & (steps <= _GAP * middle)]
         return float(np.mean(usual)) if len(usual) else middle
-    return float(np.maximum(steps, 0.0).sum()) / len(steps)
+    ends = np.flatnonzero(steps)
+    if len(ends) < 2:
+        return float(np.maximum(steps, 0.0).sum()) / len(steps)
+    return float(np.median(np.abs(steps[ends]))) * (len(ends) - 1) / float(ends[-1] - ends[0])
 
 
 def _seconds_of(texts: NDArray[np.object_], path: Path, rows: NDArray[np.int64]) -> Floats:
