@@ -64,7 +64,7 @@ mutants: $(VENV)/extra-test $(VENV)/extra-mutants $(VENV)/package
 
 # For an idle machine: what else it does would be measured too.
 bench: $(VENV)/extra-test $(VENV)/package
-	@for name in imu_path recordings stillness_speed fits memory; do \
+	@for name in imu_path recordings fits memory; do \
 		$(BIN)/python benchmarks/figures.py $$name --markdown docs/figures/$$name.md || exit 1; done
 
 clean:

@@ -4,38 +4,29 @@
 """
 Drivers and calibrators that are killed: whether the other processes notice.
 
-The benchmark itself does not use ROS. Driver and listener count in memory that they share with it,
-because a killed process cannot write its records. Each message has the number of its trial, and
-its own number in it, where the orientation would be; the sensor has no orientation.
+The benchmark itself does not use ROS: its processes are those of `nodes`, whose records it reads.
 
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
-import faulthandler
-import multiprocessing
 import os
 from pathlib import Path
 import signal
-import struct
 import subprocess
-import sys
 from tempfile import TemporaryDirectory
 import time
-from typing import Any
 
 from figures import Frame, markdown, ROOT, tell
+from nodes import (
+    CALIBRATED, client, enter_domain, node_command, PATIENCE, prepare_driver, process, Record, say,
+    wait_until)
 import numpy as np
 
-PARTIES = ('driver', 'calibrator', 'listener')
+PARTIES = ('driver', 'calibrator', 'listener', 'caller')
 RATE = 1000.0
 """Messages per second of the driver."""
-
-PATIENCE = 60.0
-"""Longest time until messages arrive, and until the self-test answers [s]."""
 
 LATEST, LATEST_END = 0.5, 1.5
 """Latest kill after the first message, or after the start, and latest end after a kill [s]."""
@@ -43,11 +34,6 @@ LATEST, LATEST_END = 0.5, 1.5
 UDP = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT',
        'FASTRTPS_DEFAULT_PROFILES_FILE': str(ROOT / 'config' / 'fast_dds_udp.xml')}
 LOCALHOST = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
-NANO = 1_000_000_000
-
-_STAMP, _NUMBERS = struct.Struct('<iI'), struct.Struct('<dd')
-_STAMP_AT, _NUMBERS_AT = 4, -296
-"""Place of the stamp and of the orientation in a serialized Imu [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -73,74 +59,6 @@ CASES = {
     'calibrator-udp': Case('the same without shared memory', 'calibrator', udp=True)}
 
 
-def begin(folder: Path, environment: dict[str, str], name: str) -> Any:
-    """Work in a folder, where a crash leaves a core and the Python stack; return a ROS node."""
-    import rclpy
-    from rclpy.signals import SignalHandlerOptions
-    os.chdir(folder)
-    os.environ.clear()
-    os.environ.update(environment)
-    faulthandler.enable((folder / 'faults.log').open('a'))
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    return rclpy.create_node(name)
-
-
-def drive(folder: Path, environment: dict[str, str], trial: Any, sent: Any) -> None:
-    """Publish a sensor at rest until the process is killed."""
-    from rclpy.serialization import serialize_message
-    from sensor_msgs.msg import Imu
-    publisher = begin(folder, environment, 'driver').create_publisher(Imu, 'imu/data_raw', 100)
-    message = Imu()
-    message.header.frame_id = 'imu_link'
-    message.orientation_covariance[0] = -1.0
-    message.linear_acceleration.z = 9.81
-    data = bytearray(serialize_message(message))
-    began, count = time.monotonic_ns(), 0
-    while True:
-        wait = began + count * NANO / RATE - time.monotonic_ns()
-        if wait > 0.0:
-            time.sleep(wait / NANO)
-        count += 1
-        now, number = time.monotonic_ns(), trial.value
-        _STAMP.pack_into(data, _STAMP_AT, now // NANO, now % NANO)
-        sent[number] += 1
-        _NUMBERS.pack_into(data, len(data) + _NUMBERS_AT, number, sent[number])
-        publisher.publish(bytes(data))
-
-
-def listen(folder: Path, environment: dict[str, str], heard: Any, first: Any, asked: Any,
-           answered: Any) -> None:
-    """
-    Count the calibrated messages of each trial until the process is killed.
-
-    The self-test is called when `asked` changes, again every 5 s until it answers.
-
-    """
-    from diagnostic_msgs.srv import SelfTest
-    from rclpy.executors import SingleThreadedExecutor
-    from sensor_msgs.msg import Imu
-
-    def on_imu(data: bytes) -> None:
-        trial, number = map(int, _NUMBERS.unpack_from(data, len(data) + _NUMBERS_AT))
-        first[trial] = first[trial] or number
-        heard[trial] += 1
-
-    node, executor = begin(folder, environment, 'listener'), SingleThreadedExecutor()
-    executor.add_node(node)
-    client = node.create_client(SelfTest, 'calibrator/self_test')
-    node.create_subscription(Imu, 'imu/data_calibrated', on_imu, 100, raw=True)
-    future, called = None, 0.0
-    while True:
-        executor.spin_once(timeout_sec=0.02)
-        if answered.value != asked.value:
-            if future is not None and future.done():
-                answered.value, future = asked.value, None
-            elif future is None or time.monotonic() - called > 5.0:
-                ready = client.service_is_ready()
-                future = client.call_async(SelfTest.Request()) if ready else None
-                called = time.monotonic()
-
-
 @dataclass(frozen=True)
 class Trial:
     """One life of the victim."""
@@ -153,79 +71,69 @@ class Trial:
 
 
 class World:
-    """The three processes, with a folder for their logs, and counters of some trials."""
+    """The processes of a case that run, and their records."""
 
-    def __init__(self, folder: Path, count: int) -> None:
-        # A server that has imported ROS starts driver and listener within 0.1 s.
-        self._context = multiprocessing.get_context('forkserver')
-        self._context.set_forkserver_preload([
-            '__main__', 'numpy', 'rclpy', 'diagnostic_msgs.srv', 'sensor_msgs.msg'])
-        self._folder = folder
-        self.running: dict[str, Any] = {}
-        self.trial = self._context.RawValue('i', 0)
-        self.sent, self.heard, self.first = (self._context.RawArray('q', count) for _ in range(3))
-        self.asked, self.answered = (self._context.RawValue('i', -1) for _ in range(2))
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self._folder, self._stack = folder, stack
+        self.log = folder / 'log'
+        self.running: dict[str, subprocess.Popen[str]] = {}
+        self.records: dict[str, Record] = {}
 
     def start(self, name: str) -> None:
-        """Start one of the processes."""
-        folder = self._folder / name
-        folder.mkdir(exist_ok=True)
-        if name == 'calibrator':
-            with (folder / 'calibrator.log').open('ab') as log:
-                self.running[name] = subprocess.Popen(
-                    [sys.executable, '-X', 'faulthandler', '-m', 'accel_calib.ros.run',
-                     'calibrator', '--ros-args', '-p', 'passthrough:=true'], cwd=folder,
-                    stdout=log, stderr=log)
-            return
-        # The environment is given, because that of the server is the one of its start.
-        own, process = (folder, dict(os.environ)), self._context.Process
-        self.running[name] = (
-            process(target=drive, args=(*own, self.trial, self.sent)) if name == 'driver' else
-            process(target=listen, args=(*own, self.heard, self.first, self.asked, self.answered)))
-        self.running[name].start()
+        """Start one of the processes; a driver still waits for a line."""
+        file = self._folder / f'{name}_{time.monotonic_ns()}'
+        commands = {'listener': client('listen', file, CALIBRATED), 'caller': client('ask', file),
+                    'calibrator': node_command('passthrough:=true')}
+        self.records[name] = Record(file)
+        self.running[name] = self._stack.enter_context(
+            prepare_driver(RATE, file, self.log) if name == 'driver' else
+            process(commands[name], self.log))
 
     def kill(self, name: str) -> None:
         """Kill a process."""
-        process = self.running.pop(name, None)
-        if process is not None:
-            process.kill()
-            (process.wait if name == 'calibrator' else process.join)()
+        if name in self.running:
+            self.running[name].kill()
+            self.running.pop(name).communicate()
 
     def end(self, after: float) -> dict[str, int]:
         """End the calibrator by SIGTERM; return its exit status if it is not 0."""
-        calibrator = self.running.pop('calibrator')
         time.sleep(after)
+        calibrator = self.running.pop('calibrator')
         calibrator.send_signal(signal.SIGTERM)
-        status = calibrator.wait(PATIENCE)
-        return {'calibrator': status} if status else {}
+        calibrator.communicate(timeout=PATIENCE)
+        return {'calibrator': calibrator.returncode} if calibrator.returncode else {}
+
+    def answer(self) -> bool:
+        """Call the self-test of the calibrator; return whether it answers."""
+        number = time.monotonic_ns()
+        say(self.running['caller'], number)
+        return self.wait(lambda: number in self.records['caller'].pairs())
 
     def died(self) -> dict[str, int]:
         """Return the exit statuses of the processes that have ended."""
-        found = {name: process.poll() if name == 'calibrator' else process.exitcode
-                 for name, process in self.running.items()}
-        return {name: status for name, status in found.items() if status is not None}
+        return {name: process.returncode for name, process in self.running.items()
+                if process.poll() is not None}
 
-    def wait(self, over: Callable[[], bool]) -> bool:
+    def wait(self, over: Callable[[], object]) -> bool:
         """Wait until a condition holds; return whether it does and no process has ended."""
-        ends = time.monotonic() + PATIENCE
-        while not over():
-            if self.died() or time.monotonic() > ends:
-                return False
-            time.sleep(0.002)
-        return True
+        return wait_until(lambda: self.died() or over()) and not self.died()
 
 
 def run_trial(world: World, case: Case, number: int, rng: np.random.Generator) -> Trial:
     """Start the victim, kill it, and look at the others."""
-    for name in PARTIES:
-        if name != case.victim and (name not in world.running or name in world.died()):
+    missing = [name for name in PARTIES if name not in world.running or name in world.died()]
+    if 'driver' in missing:
+        world.start('driver')
+    began = time.monotonic_ns()
+    for name in missing:
+        if name != 'driver':
             world.start(name)
-    world.trial.value = number
-    began, seconds, silent = time.monotonic(), np.nan, False
-    world.start(case.victim)
+    if 'driver' in missing:
+        say(world.running['driver'])
+    listened, silent = world.records['listener'], False
+    before = len(listened)
     if not (case.starting and number % 2):
-        silent = not world.wait(lambda: world.heard[number] > 0)
-        seconds = np.nan if silent else time.monotonic() - began
+        silent = not world.wait(lambda: len(listened) > before)
     ends = time.monotonic() + rng.uniform(0.0, LATEST)
     world.wait(lambda: time.monotonic() > ends)
     died = world.died()
@@ -233,11 +141,13 @@ def run_trial(world: World, case: Case, number: int, rng: np.random.Generator) -
     if case.ends and not died:
         died |= world.end(rng.uniform(0.0, LATEST_END))
     elif case.victim == 'driver' and not died:
-        world.asked.value = number
-        silent |= not world.wait(lambda: world.answered.value == number)
+        silent |= not world.answer()
     died |= world.died()
-    sent = world.sent[number] - world.first[number] + 1 if world.heard[number] else 0
-    return Trial(seconds, sent, world.heard[number], died, silent and not died)
+    heard, sent = listened.pairs()[before:], world.records['driver'].pairs()[:, 0]
+    if not len(heard):
+        return Trial(np.nan, 0, 0, died, silent and not died)
+    seconds = np.nan if case.starting and number % 2 else 1e-9 * (heard[0, 1] - began)
+    return Trial(seconds, int(np.sum(sent >= heard[0, 0])), len(heard), died, silent and not died)
 
 
 def run_case(case: Case, count: int, seed: int) -> Iterator[Trial]:
@@ -245,15 +155,11 @@ def run_case(case: Case, count: int, seed: int) -> Iterator[Trial]:
     os.environ.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
     os.environ.update(UDP if case.udp else LOCALHOST)
     rng = np.random.default_rng(seed)
-    with ExitStack() as stack:
-        folder = stack.enter_context(TemporaryDirectory())
-        os.environ.update(ROS_HOME=folder, ROS_LOG_DIR=folder)
+    with TemporaryDirectory() as folder, ExitStack() as stack:
+        world = World(Path(folder), stack)
+        enter_domain(Path(folder))
         for _ in range(case.loops):
-            loop = stack.enter_context(subprocess.Popen([sys.executable, '-c', 'while True: 1']))
-            stack.callback(loop.kill)
-        world = World(Path(folder), count)
-        for name in PARTIES:
-            stack.callback(world.kill, name)
+            stack.enter_context(process(['-c', 'while True: 1'], world.log))
         for number in range(count):
             each = run_trial(world, case, number, rng)
             tell(f'{number + 1}: {each.seconds:.2f} s, {each.heard} of {each.sent}',
@@ -280,7 +186,7 @@ def row_of(case: Case, found: list[Trial]) -> tuple[object, ...]:
     start = f'{np.median(seconds):.2f}, {seconds.max():.2f}' if len(seconds) else ''
     sent = sum(each.sent for each in found)
     lost = sent - sum(each.heard for each in found)
-    return (case.words, len(found), ends_of('calibrator'), ends_of('driver', 'listener'),
+    return (case.words, len(found), ends_of('calibrator'), ends_of('driver', 'listener', 'caller'),
             sum(each.silent for each in found),
             f'{lost:,} of {sent:,}' if case.victim == 'driver' and not case.ends else '', start)
 
@@ -288,7 +194,6 @@ def row_of(case: Case, found: list[Trial]) -> tuple[object, ...]:
 def driver_kills(frame: Frame, kills: int = 200, seed: int = 1,
                  cases: tuple[str, ...] = tuple(CASES)) -> Iterator[str]:
     """Yield the parts of the page; `kills` is the number of each case."""
-    os.environ.update(ROS_DOMAIN_ID=str(os.getpid() % 101 + 1))
     rows, loads = [], []
     for name in cases:
         rows.append(row_of(CASES[name], list(run_case(CASES[name], kills, seed))))

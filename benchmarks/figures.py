@@ -11,8 +11,6 @@ on the package of this repository and with the helpers of its tests::
 
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -21,6 +19,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
 import inspect
+import math
 import multiprocessing
 import os
 from pathlib import Path
@@ -36,9 +35,9 @@ DATA = ROOT.parent / 'shared' / 'data'
 """Folder of real recordings."""
 
 MODULES = {
-    'compare': 'changes', 'watching': 'changes', 'fits': 'speed', 'refine_cost': 'speed',
-    'stillness_speed': 'speed', 'geometry': 'poses', 'next_pose': 'poses',
-    'memory': 'recordings'}
+    'compare': 'changes', 'watching': 'changes', 'geometry': 'poses', 'next_pose': 'poses',
+    'rating': 'trust', 'robustness': 'trust', 'fits': 'speed', 'refine_cost': 'speed',
+    'recordings': 'speed', 'memory': 'speed'}
 """Modules of pages with another name."""
 
 sys.path[:0] = [str(ROOT), str(ROOT / 'test'), str(ROOT / 'benchmarks')]
@@ -50,29 +49,44 @@ use_one_thread()
 
 @dataclass(frozen=True)
 class Line:
+    """One line of a table."""
+
+    what: str  # the quantity, with its unit
+    measured: str  # its value
+    sets: int = 1  # number of sets, repeats or poses behind the value
+    asked: str = ''  # the limit; empty if nothing is asked
+    met: bool | None = None  # whether the value is within the limit; None if nothing is asked
+
+
+def check(what: str, measured: str, value: float, *, least: float = -math.inf,
+          most: float = math.inf, unit: str = '', sets: int = 1) -> Line:
+    """Return the line of a value with limits; they are not judged if it is NaN."""
+    if math.isinf(least) and math.isinf(most):
+        return Line(what, measured, sets)
+    asked = (f'{least:,g}' if least == most else f'≥ {least:,g}' if math.isinf(most) else
+             f'≤ {most:,g}' if math.isinf(least) else f'{least:,g} to {most:,g}')
+    met = None if math.isnan(value) else bool(least <= value <= most)
+    return Line(what, measured, sets, asked + unit, met)
+
+
+def share(what: str, good: Iterable[object], *, least: float = -math.inf,
+          most: float = math.inf) -> Line:
     """
-    One line of a table.
+    Return the line of the share of sets that are good, with limits [%].
 
-    Parameters
-    ----------
-    what : str
-        The quantity, with its unit.
-    measured : str
-        Its value.
-    sets : int
-        Number of sets, repeats or poses behind the value.
-    asked : str
-        The limit; empty if nothing is asked.
-    met : bool or None
-        Whether the value is within the limit; None if nothing is asked.
+    It has their number, and the exact interval for 95 % (Clopper and Pearson).
 
     """
+    from scipy.stats import binomtest  # here: processes that measure memory do without
 
-    what: str
-    measured: str
-    sets: int = 1
-    asked: str = ''
-    met: bool | None = None
+    each = [bool(one) for one in good]
+    if not each:
+        return Line(what, 'no set', 0)
+    limits = binomtest(sum(each), len(each)).proportion_ci()
+    part = 100.0 * sum(each) / len(each)
+    return check(what, f'{part:.1f} % ({sum(each)}/{len(each)}; {100.0 * limits.low:.1f} to '
+                 f'{100.0 * limits.high:.1f})', part, least=least, most=most, unit=' %',
+                 sets=len(each))
 
 
 def table(lines: Iterable[Line]) -> str:
@@ -120,18 +134,20 @@ class Measured:
     megabytes: float  # largest resident memory of the process [MB]
 
 
-def measure_alone(prepare: Callable[..., Callable[[], Any]], *given: Any) -> Measured:
-    """Return what the function takes that `prepare` returns, both called in a fresh process."""
+def measure_alone(work: Callable[..., Any], *given: Any,
+                  prepare: Callable[..., Any] | None = None) -> Measured:
+    """Return what work takes in a fresh process; what `prepare` makes of its arguments is free."""
     with ProcessPoolExecutor(1, multiprocessing.get_context('spawn')) as alone:
-        found: Measured = alone.submit(_measure, prepare, *given).result()
-    tell(prepare.__name__, *given, found)
+        found = alone.submit(_measure, work, given, prepare).result()
+    tell(work.__name__, *given, found)
     return found
 
 
-def _measure(prepare: Callable[..., Callable[[], Any]], *given: Any) -> Measured:
-    work = prepare(*given)
+def _measure(work: Callable[..., Any], given: Sequence[Any], prepare: Callable[..., Any] | None
+             ) -> Measured:
+    given = given if prepare is None else [prepare(*given)]
     before, began, cpu = largest_mb(), time.perf_counter(), time.process_time()
-    result = work()
+    result = work(*given)
     return Measured(result, time.perf_counter() - began, time.process_time() - cpu, before,
                     largest_mb())
 

@@ -12,45 +12,32 @@ folder continues the first one::
 
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 import functools
-from importlib import import_module
-import json
 import os
 from pathlib import Path
 import shutil
 from tempfile import TemporaryDirectory
 import time
 from typing import Any
-from unittest import mock
 
 import accel_calib as ac
 from accel_calib.fleet import cluster, Input, Options, recordings, run, Store, Summary
-from accel_calib.fleet.overview import not_agreeing
-from accel_calib.fleet.recording import Row
 from accel_calib.geometry import unit
 from accel_calib.logs import write_table
-import accel_calib.pipeline as pipeline
-from figures import Frame, Line, table, tell
+from accel_calib.table import Floats
+from figures import check, Frame, Line, table, tell
 import numpy as np
 
-RUN, SENSORS, ROWS = (import_module(f'accel_calib.fleet.{name}')
-                      for name in ('run', 'sensors', 'recording'))
+Row = Mapping[str, Any]
+"""A sensor in the results."""
 
-MERGED, DIGESTED = 'merge and compare on the workers', 'digests on the workers'
-ALONE = {'rows of the sensors': 'write_sensors', 'typical values': 'priors_of',
-         'page': 'write_fleet_page'}
-"""What the program does alone at the end, and its functions; the first is a part of `MERGED`."""
-
-MOST_ALONE = 0.03
-"""Largest share of the time in which the program works alone."""
+MOST_AFTER = 3.0
+"""Largest processor time of the program after the recordings, of the whole run [%]."""
 
 POSES = 14
 DAMAGED = 0.03
@@ -79,8 +66,8 @@ EVERY = timedelta(days=18)
 YEAR = timedelta(days=365.25)
 
 LEAST_RATIO = 1.8
-MOST_RISE = 0.1
-"""Largest relative rise of the memory between two parts of the run that counts as flat."""
+MOST_RISE = 10.0
+"""Largest rise of the memory between two parts of the run that counts as flat [%]."""
 
 PARTS = (0.1, 0.5, 1.0)
 SAMPLED = 100
@@ -91,9 +78,6 @@ TIMED = {True: 200, False: 1200}
 
 TURNS = 3
 """Number of times that both are timed, in turns."""
-
-STAGED = 10
-"""Sensors for the cost by stage, in one process."""
 
 MILLION = 1_000_000
 HOUR_S = 3600.0
@@ -177,9 +161,10 @@ RIGHT = {'drifts': (f'the right drift within {LIMIT_SD:g} standard deviations', 
          'changes': ('this change alone for good', is_change_right)}
 
 
-def lines_of_changes(made: Sequence[Sensor], rows: Sequence[Row]) -> Iterator[Line]:
-    """Yield how many sensors of each kind the page lists as changed, and whether rightly so."""
-    listed = {row['sensor']: row for row in not_agreeing(rows)}
+def lines_of_changes(made: Sequence[Sensor], summary: Summary) -> Iterator[Line]:
+    """Yield how many sensors of each kind are listed as changed, and whether rightly so."""
+    changed = {sensor for sensor, *_ in summary.changes}
+    listed = {row['sensor']: row for row in summary.sensors if row['sensor'] in changed}
     kinds: dict[tuple[str, str], list[Sensor]] = defaultdict(list)
     for each in made:
         kinds[each.name[0], each.kind].append(each)
@@ -195,183 +180,113 @@ def lines_of_changes(made: Sequence[Sensor], rows: Sequence[Row]) -> Iterator[Li
 
 # -------------------------------------------------------------------------------- speed and memory
 
-def memory_mb() -> float:
-    """Return the resident memory of this process [MB]."""
-    pages = int(Path('/proc/self/statm').read_text(encoding='ascii').split()[1])
-    return pages * os.sysconf('SC_PAGE_SIZE') / 1e6
+@dataclass(frozen=True)
+class Run:
+    """What was done, and what is seen of it from outside."""
 
+    summary: Summary
+    # (n + 2, 2) clock and processor time of the program with the scheduler, since the beginning
+    # [s]: at the beginning, after each recording, and at the end.
+    clocks: Floats
+    memory: Mapping[float, tuple[float, float]]  # of `memory_mb`, by share of the recordings
 
-class Watch:
-    """Moments and memory of a run, and the progress function that records them."""
-
-    def __init__(self, client: Any, log: Path | None = None) -> None:
-        self.client, self.log = client, log
-        self.moments: list[float] = []
-
-    def __call__(self, done: int, count: int) -> None:
-        """Record a moment; sample the memory at parts of the run."""
-        self.moments.append(time.perf_counter())
-        if self.log and (done == count or done % max(count // SAMPLED, 1) == 0):
-            line = {'done': done, 'count': count, 'program': memory_mb(),
-                    'worker': max(self.client.run(memory_mb).values()),
-                    'seconds': self.moments[-1] - self.moments[0]}
-            with self.log.open('a', encoding='utf-8') as file:
-                print(json.dumps(line), file=file)
-
+    @property
     def per_s(self) -> float:
-        """Return recordings per second without the ends: the slope, since some arrive together."""
-        tenth = len(self.moments) // 10
-        middle = np.array(self.moments[tenth:len(self.moments) - tenth])
+        """Return recordings per second without the ends: the slope, as some arrive together."""
+        tenth = len(self.clocks) // 10
+        middle = self.clocks[1 + tenth:-1 - tenth, 0]
         return 1.0 / float(np.polyfit(np.arange(len(middle)), middle, 1)[0])
 
 
-def lines_of_workers(found: Sequence[Input], options: Options, folder: Path) -> Iterator[Line]:
-    """Yield the speed with one and two workers, in turns, with and without the search."""
-    def speed(some: Sequence[Input], options: Options, workers: int) -> float:
-        with TemporaryDirectory(dir=folder) as out, cluster(workers=workers) as client:
-            client.wait_for_workers(workers)
-            watch = Watch(client)
-            run(client, some, options, Store(Path(out)), watch)
-        return watch.per_s()
+def memory_mb(client: Any) -> tuple[float, float]:
+    """Return the resident memory of the largest worker, and of the program [MB]."""
+    def own() -> float:
+        pages = int(Path('/proc/self/statm').read_text(encoding='ascii').split()[1])
+        return pages * os.sysconf('SC_PAGE_SIZE') / 1e6
 
-    for refined, count in TIMED.items():
-        some, kind = found[:count], 'with' if refined else 'without'
-        turns = np.array([[speed(some, replace(options, refined=refined), workers)
-                           for workers in (1, 2)] for _ in range(TURNS)])
-        one, two = np.median(turns, axis=0)
-        for name, each in (('1 worker', one), ('2 workers', two)):
-            yield Line(f'recordings per second {kind} the search, {name}', f'{each:.1f}',
-                       len(some))
-        yield Line(f'2 workers against 1, {kind} the search (by turn '
-                   + ', '.join(f'{after / before:.2f}' for before, after in turns) + ')',
-                   f'{two / one:.2f}', TURNS, f'>= {LEAST_RATIO}', bool(two / one >= LEAST_RATIO))
+    return max(client.run(own).values()), own()
 
 
-def lines_of_memory(log: Path, workers: int) -> Iterator[Line]:
-    """Yield the memory at parts of the run, which several calls may have made."""
-    samples = [json.loads(line) for line in log.read_text(encoding='utf-8').splitlines()]
-    for who, of in (('worker', f'largest of {workers} workers'), ('program', 'program')):
-        first = None
-        for part in PARTS:
-            sample = next((each for each in samples if each['done'] >= part * each['count']), None)
-            if sample is None:
-                continue
-            first = first or sample[who]
-            rise, later = sample[who] / first - 1.0, part > PARTS[0]
-            yield Line(f'{of} after {part:.0%} of the recordings, MB', f'{sample[who]:.0f}', 1,
-                       f'<= {MOST_RISE:+.0%}' if later else '',
-                       rise <= MOST_RISE if later else None)
+def watch_run(found: Sequence[Input], options: Options, workers: int, folder: Path) -> Run:
+    """Calibrate recordings on a cluster of this machine, or those that are left."""
+    clocks, memory = [], {}
 
+    def look() -> None:
+        clocks.append((time.perf_counter(), time.process_time()))
 
-@contextmanager
-def time_stages(spent: dict[str, float], stages: Mapping[str, tuple[Any, str]],
-                clock: Callable[[], float] = time.perf_counter) -> Iterator[None]:
-    """Add up the time of functions, by stage; a function is an object and a name in it."""
-    def with_timer(stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(function)
-        def run_timed(*given: Any, **options: Any) -> Any:
-            begin = clock()
-            try:
-                return function(*given, **options)
-            finally:
-                spent[stage] += clock() - begin
-        return run_timed
+    def on_progress(done: int, count: int) -> None:
+        look()
+        if done == count or done % max(count // SAMPLED, 1) == 0:
+            memory[done / count] = memory_mb(client)
 
-    with ExitStack() as stack:
-        for stage, (owner, name) in stages.items():
-            stack.enter_context(
-                mock.patch.object(owner, name, with_timer(stage, getattr(owner, name))))
-        yield
-
-
-def costs_by_stage(found: Sequence[Input], options: Options, folder: Path) -> dict[str, float]:
-    """Return the cost by stage in one process [ms of processor per recording]."""
-    spent: dict[str, float] = defaultdict(float)
-    here = mock.patch.object(RUN.WorkerProcess, 'call',
-                             lambda self, function, *given, limit_s=None: function(*given))
-    with TemporaryDirectory(dir=folder) as out, here:
-        store = Store(Path(out))
-        first = Store(store.folder / 'first')
-        RUN.calibrate_recording(found[0], options, first, RUN.LIMIT_S)  # imports
-        with time_stages(spent, {
-                'all': (RUN, 'calibrate_recording'), 'hash': (RUN, 'content_hash'),
-                'read and capture': (ROWS, 'poses_of'), 'fit': (pipeline, 'fit_poses'),
-                'refine': (pipeline, '_refinement'), 'rate': (pipeline, 'rate'),
-                'fit for the prior': (ROWS, 'fit_poses'),
-                'write the calibration': (RUN, 'write_calibration'),
-                'write the row': (Store, 'add')}, time.process_time):
-            for each in found:
-                RUN.calibrate_recording(each, options, store, RUN.LIMIT_S)
-        spent['other'] = 2.0 * spent['all'] - sum(spent.values())
-        with time_stages(spent, {
-                'merge': (Store, 'merge'), 'compare': (SENSORS, '_compared'),
-                'read the calibrations': (SENSORS, 'read_calibration'),
-                'finish': (Store, 'finish'), 'digest': (RUN, 'digest_of')}, time.process_time):
-            names = store.waiting()
-            for name in names:
-                SENSORS.merge_sensor(name, store)
-            for name in names:
-                store.finish(name)
-                RUN.digest_of(name, store)
-    return {stage: 1e3 * seconds / len(found) for stage, seconds in spent.items()}
-
-
-@dataclass(frozen=True)
-class Whole:
-    """The run over all recordings, or those that are left."""
-
-    summary: Summary  # what was done
-    per_s: float  # recordings per second
-    seconds: float  # duration [s]
-    program_s: float  # processor time of the program with the scheduler [s]
-    memory: float  # resident memory of the program at the end [MB]
-    after: Mapping[str, float]  # seconds of the stages after the recordings
-
-
-def run_whole(found: Sequence[Input], options: Options, workers: int, folder: Path) -> Whole:
-    """Calibrate all recordings, or those that are left."""
-    spent: dict[str, float] = defaultdict(float)
     with cluster(workers=workers) as client:
         client.wait_for_workers(workers)
-        begin, program_s = time.perf_counter(), time.process_time()
-        watch = Watch(client, folder / 'memory.jsonl')
-        with time_stages(spent, {MERGED: (RUN, '_merge'), DIGESTED: (RUN, 'overview'),
-                                 **{stage: (RUN, name) for stage, name in ALONE.items()}}):
-            summary = run(client, found, options, Store(folder / 'results'), watch)
-        return Whole(summary, watch.per_s(), time.perf_counter() - begin,
-                     time.process_time() - program_s, memory_mb(), spent)
+        look()
+        summary = run(client, found, options, Store(folder), on_progress)
+        look()
+        memory[np.inf] = memory_mb(client)
+    return Run(summary, np.array(clocks) - clocks[0], memory)
 
 
-def lines_of_run(done: Whole, workers: int) -> Iterator[Line]:
-    """Yield the figures of the run over all recordings."""
-    counts = done.summary.counts
-    total = sum(counts.values())
+def time_workers(found: Sequence[Input], options: Options, folder: Path, refined: bool) -> Floats:
+    """Return the speed of one and of two workers, by turn, with or without the search [1/s]."""
+    def speed(workers: int) -> float:
+        with TemporaryDirectory(dir=folder) as out:
+            return watch_run(found[:TIMED[refined]], replace(options, refined=refined), workers,
+                             Path(out)).per_s
+
+    return np.array([[speed(workers) for workers in (1, 2)] for _ in range(TURNS)])
+
+
+def lines_of_workers(speeds: Mapping[bool, Floats], most: int) -> Iterator[Line]:
+    """Yield the speed with one and two workers, on so many recordings at most."""
+    for refined, turns in speeds.items():
+        (one, two), kind = np.median(turns, axis=0), 'with' if refined else 'without'
+        for name, each in (('1 worker', one), ('2 workers', two)):
+            yield Line(f'recordings per second {kind} the search, {name}', f'{each:.1f}',
+                       min(TIMED[refined], most))
+        yield check(f'2 workers against 1, {kind} the search (by turn '
+                    + ', '.join(f'{after / before:.2f}' for before, after in turns) + ')',
+                    f'{two / one:.2f}', two / one, least=LEAST_RATIO, sets=TURNS)
+
+
+def lines_of_run(done: Run, workers: int) -> Iterator[Line]:
+    """Yield the memory and the times of the run over all recordings."""
+    for who, of in enumerate((f'largest of {workers} workers', 'program')):
+        at = [next(mb[who] for share, mb in done.memory.items() if share >= part)
+              for part in PARTS]
+        yield Line(f'{of} after {PARTS[0]:.0%} of the recordings, MB', f'{at[0]:.0f}')
+        for part, each in zip(PARTS[1:], at[1:]):
+            yield check(f'{of} after {part:.0%} of the recordings, MB (rise [%])',
+                        f'{each:.0f} ({100.0 * (each / at[0] - 1.0):.0f})',
+                        100.0 * (each / at[0] - 1.0), most=MOST_RISE, unit=' %')
+    counts, (seconds, program_s) = done.summary.counts, done.clocks[-1]
     words = ', '.join(f'{count:,} {name}' for name, count in sorted(counts.items()))
-    yield Line(f'whole run, minutes ({words})', f'{done.seconds / 60.0:.1f}', total)
+    total, (after_s, alone_s) = sum(counts.values()), done.clocks[-1] - done.clocks[-2]
+    yield Line(f'whole run, minutes ({words})', f'{seconds / 60.0:.1f}', total)
     yield Line(f'all recordings, per second with {workers} workers', f'{done.per_s:.1f}', total)
     yield Line('program with the scheduler, ms of processor per recording',
-               f'{1e3 * done.program_s / total:.2f}', total)
-    yield Line('program at the end, with the libraries of the page, MB', f'{done.memory:.0f}')
-    for stage, seconds in done.after.items():
-        yield Line(f'after the recordings: {stage}, seconds', f'{seconds:.1f}', total)
-    alone = sum(done.after.get(stage, 0.0) for stage in ALONE) / done.seconds
-    yield Line('what the program does alone, of the whole run', f'{alone:.1%}', 1,
-               f'<= {MOST_ALONE:.0%}', alone <= MOST_ALONE)
+               f'{1e3 * program_s / total:.2f}', total)
+    yield Line('program at the end, with the libraries of the page, MB',
+               f'{done.memory[np.inf][1]:.0f}')
+    yield Line('comparison, typical values and page after the recordings, seconds',
+               f'{after_s:.1f}', total)
+    yield check('processor time of the program after the recordings, of the whole run [%]',
+                f'{100.0 * alone_s / seconds:.1f}', 100.0 * alone_s / seconds, most=MOST_AFTER,
+                unit=' %')
 
 
-def lines_of_costs(costs: Mapping[str, float], done: Whole, calibrations: int, workers: int, *,
+def lines_of_costs(speeds: Mapping[bool, Floats], done: Run, calibrations: int, workers: int, *,
                    refined: bool) -> Iterator[Line]:
-    """Yield the cost by stage, and what a million robots need."""
-    for stage, cost in costs.items():
-        if stage != 'all':
-            yield Line(f'{stage}, ms of processor per recording', f'{cost:.2f}',
-                       STAGED * calibrations)
-    each_s = workers / done.per_s
+    """Yield what a recording costs, and what a million robots need."""
+    after_s = done.clocks[-1, 0] - done.clocks[-2, 0]
+    end_s = after_s * workers / sum(done.summary.counts.values())
+    each_s, alone_s = workers / done.per_s, {
+        key: 1.0 / float(np.median(turns[:, 0])) for key, turns in speeds.items()}
     yield Line('a recording of the whole run on a worker, ms', f'{1e3 * each_s:.1f}')
-    count = sum(done.summary.counts.values())
-    end_s = sum(done.after.get(stage, 0.0) for stage in (MERGED, DIGESTED)) * workers / count
-    for kind, search in (('the search', costs['refine']), ('no search', 0.0)):
-        more_s = (search - (costs['refine'] if refined else 0.0)) / 1e3
+    yield Line('its comparison with others of the sensor, on a worker, ms', f'{1e3 * end_s:.1f}')
+    for kind, search in (('the search', True), ('no search', False)):
+        more_s = alone_s[search] - alone_s[refined]
         hours = MILLION * calibrations * (each_s + end_s + more_s) / HOUR_S
         yield Line(f'a million robots with {calibrations} recordings each and {kind}, core hours',
                    f'{hours:,.0f}')
@@ -397,17 +312,12 @@ def fleet(frame: Frame, sensors: int = 10_000, calibrations: int = 20, workers: 
         found = list(recordings([str(folder / 'in')]))
         mixed = np.random.default_rng(seed).permutation(len(found)).tolist()
         some = [found[k] for k in mixed[:max(TIMED.values())]]
-        lines = list(lines_of_workers(some, options, folder))
-        firsts = dict.fromkeys(k - k % calibrations for k in mixed[:STAGED])
-        staged = [found[first + k] for first in firsts for k in range(calibrations)]
-        costs = costs_by_stage(staged, replace(options, refined=True), folder)
-        done = run_whole(found, options, workers, folder)
-        lines += [*lines_of_memory(folder / 'memory.jsonl', workers),
-                  *lines_of_run(done, workers), *lines_of_changes(
-                      [draw_sensor(k, calibrations, seed) for k in range(sensors)],
-                      done.summary.sensors),
-                  *lines_of_costs(costs, done, calibrations, workers, refined=not no_refine)]
-    yield table(lines)
+        speeds = {refined: time_workers(some, options, folder, refined) for refined in TIMED}
+        done = watch_run(found, options, workers, folder / 'results')
+        made = [draw_sensor(k, calibrations, seed) for k in range(sensors)]
+        yield table([
+            *lines_of_workers(speeds, len(found)), *lines_of_run(done, workers),
+            *lines_of_changes(made, done.summary),
+            *lines_of_costs(speeds, done, calibrations, workers, refined=not no_refine)])
     yield f'{sensors:,} simulated sensors with {calibrations} pose tables of {POSES} poses each'
-    yield f'in one process on {len(staged)} recordings of whole sensors'
     yield f'million robots with {calibrations} recordings each need the core hours'

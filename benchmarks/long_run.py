@@ -9,16 +9,16 @@ round begins without poses and without a calibration.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 import time
 from typing import Any
 
-from figures import Frame, Line, markdown, table, tell
-from nodes import Caller, cpu_seconds, node_command, relay_command, run_trial, Stamps, Trial
+from figures import check, Frame, Line, markdown, table, tell
+from nodes import CALIBRATED, Caller, client, cpu_seconds, node_command, run_trial, Trial
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,41 +53,36 @@ class Answer:
 class LongRun:
     """The measurements of a run."""
 
-    edges: Stamps  # (n + 1,) times of the samples [ns]
+    trial: Trial  # of the node, and of the bare relay
     per_round: int  # number of intervals of a round
-    # (n + 1,) each: resident memory of the node, the part of it that no other process shares
-    # (own), resident memory of its worker and of the bare relay [MB]; CPU time of the node
-    # without its worker (cpu), and of the bare relay (bare) [s].
+    # (n + 1,) each, at the ends of the intervals: time [ns]; resident memory of the node, the part
+    # of it that no other process shares (own), resident memory of its worker and of the bare relay
+    # [MB]; CPU time of the node without its worker (cpu), and of the bare relay (bare) [s].
     samples: dict[str, Floats]
-    sent: Stamps  # (m,) stamps of the messages of the driver [ns]
-    ours: Stamps  # (k, 2) stamp and arrival of the messages of the node [ns],
-    bare: Stamps  # and of the bare relay
     answers: list[Answer]  # of the services
-    log: str  # what the node printed
 
-    def count(self, stamps: Stamps) -> NDArray[np.int64]:
-        """Return the number of different stamps in each interval."""
-        return np.histogram(np.unique(stamps), self.edges)[0]
+    @cached_property
+    def parts(self) -> list[Trial]:
+        """Return the trial by intervals."""
+        return [self.trial.between(*ends) for ends in pairwise(self.samples['at'].astype(int))]
 
-    def lost(self, heard: Stamps) -> NDArray[np.int64]:
-        """Return the number of messages in each interval that did not arrive."""
-        return self.count(self.sent[~np.isin(self.sent, heard[:, 0])])
+    @property
+    def sent(self) -> NDArray[np.int64]:
+        """Return the number of messages sent in each interval."""
+        return np.array([len(part.sent) for part in self.parts])
 
     def cpu_us(self, name: str) -> Floats:
         """Return the CPU time per message in each interval [µs]."""
-        return np.diff(self.samples[name]) * 1e6 / self.count(self.sent)
+        return np.diff(self.samples[name]) * 1e6 / self.sent
 
-    def latency_us(self, heard: Stamps, percent: float) -> Floats:
+    def latency_us(self, program: int, percent: float) -> Floats:
         """Return a percentile of the latency in each interval [µs]; NaN without a message."""
-        each = np.digitize(heard[:, 0], self.edges) - 1
-        late = (heard[:, 1] - heard[:, 0]) * 1e-3
-        return np.array([np.percentile(late[each == k], percent) if np.any(each == k) else np.nan
-                         for k in range(len(self.edges) - 1)])
+        return np.array([part.latency_us(percent, program) for part in self.parts])
 
     @property
     def warm(self) -> int:
         """Return the number of intervals of the warm-up: a sixth of the run, in whole rounds."""
-        rounds = -(-(len(self.edges) - 1) // (6 * self.per_round))
+        rounds = -(-len(self.parts) // (6 * self.per_round))
         return rounds * self.per_round
 
     def trend(self, column: Floats) -> tuple[float, float]:
@@ -98,7 +93,8 @@ class LongRun:
         few for a standard error.
 
         """
-        hours = (self.edges[-len(column):] - self.edges[0])[self.warm:] * 1e-9 / HOUR
+        at = self.samples['at']
+        hours = (at[-len(column):] - at[0])[self.warm:] * 1e-9 / HOUR
         values = column[self.warm:]
         place = np.arange(len(values)) % self.per_round
         design = np.column_stack([hours, place[:, np.newaxis] == np.arange(self.per_round)])
@@ -108,10 +104,6 @@ class LongRun:
         found = np.linalg.lstsq(design, values, rcond=None)[0]
         variance = float(np.sum((values - design @ found)**2)) / free
         return float(found[0]), float(np.sqrt(variance * np.linalg.inv(design.T @ design)[0, 0]))
-
-    def called(self, name: str) -> list[Answer]:
-        """Return the answers of a service."""
-        return [each for each in self.answers if each.name == name]
 
 
 def memory_mb(pid: int) -> tuple[float, float]:
@@ -185,13 +177,12 @@ def run_rounds(rounds: int, seconds: float, interval: float, rate: float) -> Lon
         caller.close()
 
     trial: Trial = run_trial({
-        'imu/data_calibrated': node_command('passthrough:=true'),
-        'bare/data_calibrated': relay_command('serialized', 'bare/data_calibrated')},
+        CALIBRATED: node_command('passthrough:=true'),
+        'bare/data_calibrated': client('relay', 'serialized', 'bare/data_calibrated')},
         rate, during)
     columns = {name: np.array([each[name] for each in samples[:rounds * per_round + 1]])
                for name in samples[0]}
-    ours, bare = trial.heard
-    return LongRun(columns['at'], per_round, columns, trial.sent, ours, bare, answers, trial.log)
+    return LongRun(trial, per_round, columns, answers)
 
 
 def trend_words(slope: float, error: float, unit: str) -> str:
@@ -200,27 +191,26 @@ def trend_words(slope: float, error: float, unit: str) -> str:
 
 
 def lines_of(run: LongRun) -> Iterator[Line]:
-    lost, bare = run.lost(run.ours).sum(), run.lost(run.bare).sum()
+    lost, bare = (sum(part.lost(program) for part in run.parts) for program in (0, 1))
     answered = [each for each in run.answers if each.words]
     refused = sum(not each.success for each in answered)
-    faults = run.log.count('Traceback') + run.log.count('unexpected error')
-    yield Line('messages lost', f'{lost} of {run.count(run.sent).sum():,} (bare relay: {bare})', 1,
-               '0', lost == 0)
+    faults = sum(map(run.trial.log.count, ('Traceback', 'unexpected error')))
+    yield check('messages lost', f'{lost} of {run.sent.sum():,} (bare relay: {bare})', lost,
+                least=0, most=0)
     yield Line('calls answered', f'{len(answered)} of {len(run.answers)}', 1, 'all',
                len(answered) == len(run.answers))
-    yield Line('calls refused', f'{refused} of {len(answered)}', 1, '0', refused == 0)
-    yield Line('tracebacks', f'{faults}', 1, '0', faults == 0)
+    yield check('calls refused', f'{refused} of {len(answered)}', refused, least=0, most=0)
+    yield check('tracebacks', f'{faults}', faults, least=0, most=0)
     for what, name in (('the node, resident', 'node'), ('the node, its own part', 'own'),
                        ('the worker process, resident', 'worker'),
                        ('the bare relay, resident', 'relay')):
         slope, error = run.trend(run.samples[name])
         warm, last = run.samples[name][[run.warm, -1]]
-        asked = name != 'relay'
-        yield Line(f'memory of {what}', f'{warm:.1f} MB after the warm-up, {last:.1f} MB at the '
-                   f'end, {trend_words(slope, error, "MB per hour")}', len(run.edges) - run.warm,
-                   '< 1 MB per hour' if asked else '',
-                   slope < 1.0 if asked and not np.isnan(slope) else None)
-    p99, bare_p99 = (run.latency_us(each, 99) for each in (run.ours, run.bare))
+        yield check(f'memory of {what}', f'{warm:.1f} MB after the warm-up, {last:.1f} MB at the '
+                    f'end, {trend_words(slope, error, "MB per hour")}', slope,
+                    most=np.inf if name == 'relay' else 1.0, unit=' MB per hour',
+                    sets=len(run.parts) + 1 - run.warm)
+    p99, bare_p99 = (run.latency_us(program, 99) for program in (0, 1))
     for what, column, unit in (
             ('CPU time per message', run.cpu_us('cpu'), 'µs'),
             ('CPU time per message over that of the bare relay',
@@ -237,20 +227,6 @@ def lines_of(run: LongRun) -> Iterator[Line]:
                    slope <= 2.0 * error if asked and not np.isnan(slope) else None)
 
 
-def intervals_of(run: LongRun) -> str:
-    """Return a table with one line per interval."""
-    heads = ('to, min', 'sent', 'received', 'lost', 'node, MB', 'own part, MB', 'worker, MB',
-             'CPU, µs', 'p50, µs', 'p99, µs', 'bare CPU, µs', 'bare p50, µs', 'bare p99, µs')
-    columns = [(run.edges[1:] - run.edges[0]) * 1e-9 / 60.0, run.count(run.sent),
-               run.count(run.ours[:, 0]), run.lost(run.ours),
-               *(run.samples[name][1:] for name in ('node', 'own', 'worker')),
-               run.cpu_us('cpu'), run.latency_us(run.ours, 50), run.latency_us(run.ours, 99),
-               run.cpu_us('bare'), run.latency_us(run.bare, 50), run.latency_us(run.bare, 99)]
-    forms = ['{:.1f}', *3 * ['{:d}'], *3 * ['{:.1f}'], *6 * ['{:.0f}']]
-    return markdown(heads, ([form.format(value) for form, value in zip(forms, row)]
-                            for row in zip(*columns, strict=True)))
-
-
 def long_run(frame: Frame, minutes: float = 60.0, rate: float = 1000.0) -> Iterator[str]:
     rounds, seconds, interval = round(minutes / 5.0), 300.0, 60.0
     if minutes < 10.0:
@@ -261,11 +237,11 @@ def long_run(frame: Frame, minutes: float = 60.0, rate: float = 1000.0) -> Itera
         if not each.success:
             tell(f'{each.name}: {each.words or "no answer"}')
     yield table(lines_of(run))
-    called = {name: found for name in (*CALLS, 'reset') if (found := run.called(name))}
+    called = {name: found for name in (*CALLS, 'reset') if (
+        found := [each for each in run.answers if each.name == name])}
     yield markdown(('service', 'calls', 'failed', 'longest answer, s'), (
         (f'`~/{name}`', len(found), sum(not each.success for each in found),
          f'{max(each.seconds for each in found):.2f}') for name, found in called.items()))
-    yield intervals_of(run)
     yield f'through poses at {rate:g} Hz'
     yield f'at the end of each round of {seconds:g} s'
     yield f'after a warm-up of {run.warm * interval / 60.0:g} min'

@@ -11,8 +11,6 @@ processes are left out, and the share that is killed is a lower bound.
 
 """
 
-from __future__ import annotations
-
 import ast
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator

@@ -6,23 +6,21 @@ The processes of the benchmarks of nodes: a driver, the node, bare relays, a use
 
 The driver publishes a sensor that is turned through `POSES` poses, again and again. It has effects
 of temperature and a non-linear one, so that a refinement finds something. It stamps each message
-with the monotonic clock and records the stamps; the user records stamp and arrival. Both write
-their records as arrays at the end of standard input. All are as cheap as rclpy allows: serialized
-messages under EventsExecutor. They have the qualities of service of the node, so that only the
-work differs.
+with the monotonic clock and records the stamps; the user records stamp and arrival. A `Record`
+outlives a process that is killed. All are as cheap as rclpy allows: serialized messages under
+EventsExecutor. They have the qualities of service of the node, so that only the work differs. They
+end with their standard input.
 
 """
 
-from __future__ import annotations
-
-from array import array
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass, replace
 import itertools
+import mmap
 import os
 from pathlib import Path
-from select import select
 import signal
 import struct
 import subprocess
@@ -33,6 +31,7 @@ import time
 from typing import Any
 
 from accel_calib.ros.simulator_node import SimulatedImu, SimulatorSettings
+from diagnostic_msgs.srv import SelfTest
 from figures import ROOT
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +43,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from sensor_msgs.msg import Imu, Temperature
+from shared import KNOWN
+from std_srvs.srv import Trigger
 
 Stamps = NDArray[np.int64]
 
@@ -56,9 +57,8 @@ POSES, DWELL, TURN = 40, 2.0, 0.5
 CYCLE = POSES * (DWELL + TURN)
 """Time until the poses begin again [s]; the temperature swings in the same time."""
 
-EFFECTS = ['offset=0.03,-0.02,0.04', 'axis_gain=0.012,-0.015,0.008',
-           'cross_axis=0.006,-0.004,0.003', 'offset_temperature=0.001,-0.0005,0.0008',
-           'quadratic=0.002,-0.001,0.001']
+MORE = {'offset_temperature': [0.001, -0.0005, 0.0008], 'quadratic': [0.002, -0.001, 0.001]}
+"""Effects of the driver beside those of `KNOWN`."""
 
 SETTLE = 2.0
 """Time from the first message to the start of the measurement [s]."""
@@ -72,14 +72,48 @@ _STAMP_AT, _RATE, _FORCE = 4, slice(-192, -168), slice(-96, -72)
 
 _DOMAINS = itertools.islice(itertools.cycle(range(1, 102)), os.getpid() % 101, None)
 
+IMU, CALIBRATED = 'imu/data_raw', 'imu/data_calibrated'
 
-def drive(rate: float, file: Path) -> None:
-    """Publish messages at a rate [1/s] and record their stamps; 0: without a pause."""
-    often = rate or 1e4
+
+class Record:
+    """Pairs of stamp and arrival [ns] in a file, which one process writes and others read."""
+
+    SIZE = 2**24
+
+    def __init__(self, file: Path) -> None:
+        with file.open('a+b') as opened:
+            opened.truncate(16 * self.SIZE)  # takes no space before it is written
+            self._cells = memoryview(mmap.mmap(opened.fileno(), 16 * self.SIZE)).cast('q')
+        self._next = 0
+
+    def add(self, stamp: int, arrival: int) -> None:
+        """Add a pair."""
+        self._cells[self._next + 1] = arrival
+        self._cells[self._next] = stamp
+        self._next += 2
+
+    def __len__(self) -> int:
+        return bisect_left(range(self.SIZE), True, key=lambda k: self._cells[2 * k] == 0)
+
+    def pairs(self) -> Stamps:
+        """Return all pairs so far, (n, 2)."""
+        return np.frombuffer(self._cells, np.int64).reshape(-1, 2)[:len(self)].copy()
+
+
+def drive(rate: str, file: str) -> None:
+    """
+    Publish messages at a rate [1/s] and record their stamps; 0: without a pause.
+
+    Once they are prepared, it says so, and waits for a line before it enters DDS.
+
+    """
+    per_s, record = float(rate), Record(Path(file))
+    often = per_s or 1e4
     settings = SimulatorSettings(  # fewer poses where they have more samples
         rate=often, poses=round(POSES * min(1e3 / often, 1.0)), dwell=DWELL, turn=TURN,
-        mixed=True, flat_last=False, effects=EFFECTS, temperature=[15.0, 35.0],
-        temperature_period=CYCLE)
+        mixed=True, flat_last=False, temperature=[15.0, 35.0], temperature_period=CYCLE,
+        effects=[f'{name}={",".join(map(str, values))}'
+                 for name, values in {**KNOWN, **MORE}.items()])
     simulated = SimulatedImu(settings)
     made = simulated.samples(round(simulated.duration * settings.rate))
     forces, rates = made.reading * settings.gravity, made['rate']
@@ -88,26 +122,33 @@ def drive(rate: float, file: Path) -> None:
     message.orientation_covariance[0] = -1.0
     message.angular_velocity_covariance = (np.eye(3) * 0.002**2).ravel()
     message.linear_acceleration_covariance = (np.eye(3) * 0.02**2).ravel()
-    data, over, sent = bytearray(serialize_message(message)), ended(), array('q')
-    node = Node('driver')
-    imu = node.create_publisher(Imu, 'imu/data_raw', STREAM)
+    data = bytearray(serialize_message(message))
+    print('ready', flush=True)
+    sys.stdin.readline()
+    over, node = ended(), enter('driver')
+    imu = node.create_publisher(Imu, IMU, STREAM)
     temperature = node.create_publisher(Temperature, 'temperature', STREAM)
     warm_every, began = round(settings.rate / 10.0), time.monotonic_ns()
-    while not over():
-        wait = began + len(sent) * NANO / rate - time.monotonic_ns() if rate else 0.0
+    for count in itertools.count():
+        wait = began + count * NANO / per_s - time.monotonic_ns() if per_s else 0.0
         if wait > 0.0:
             time.sleep(wait / NANO)
-        row = len(sent) % len(forces)
+        if over():
+            break
+        row = count % len(forces)
         data[_FORCE], data[_RATE] = forces[row].tobytes(), rates[row].tobytes()
         now = time.monotonic_ns()
         _STAMP.pack_into(data, _STAMP_AT, now // NANO, now % NANO)
+        record.add(now, now)
         imu.publish(bytes(data))
-        sent.append(now)
-        if len(sent) == 1:
-            print(now, flush=True)
-        if len(sent) % warm_every == 0:
+        if (count + 1) % warm_every == 0:
             temperature.publish(Temperature(temperature=float(made['temperature'][row])))
-    np.save(file, np.array(sent))
+
+
+def enter(name: str) -> Node:
+    """Enter DDS with a node."""
+    rclpy.init(args=[])
+    return Node(name)
 
 
 def ended() -> Callable[[], bool]:
@@ -122,49 +163,56 @@ def ended() -> Callable[[], bool]:
     return over.is_set
 
 
-def listen(file: Path, *topics: str) -> None:
-    """Record stamp and arrival of the messages of topics, in arrays that do not slow down."""
-    node = Node('user')
-    heard = {topic: array('q') for topic in topics}
+def listen(*given: str) -> None:
+    """Record stamp and arrival of messages; `given` are, for each topic, a file and the topic."""
+    node = enter('user')
 
-    def subscribe(topic: str, record: array[int]) -> None:
+    def subscribe(file: str, topic: str) -> None:
+        record = Record(Path(file))
+
         def on_imu(data: bytes) -> None:
             now = time.monotonic_ns()
             seconds, rest = _STAMP.unpack_from(data, _STAMP_AT)
-            record.extend((seconds * NANO + rest, now))
+            record.add(seconds * NANO + rest, now)
 
         node.create_subscription(Imu, topic, on_imu, USER, raw=True)
 
-    for each in heard.items():
-        subscribe(*each)
-    executor, over, printed = EventsExecutor(), ended(), False
+    for file, topic in zip(given[::2], given[1::2], strict=True):
+        subscribe(file, topic)
+    spin(node, EventsExecutor(), 0.05)
+
+
+def spin(node: Node, executor: Any, seconds: float) -> None:
+    """Run a node until standard input has ended, at which it looks every so many seconds."""
+    over = ended()
     executor.add_node(node)
     while not over():
-        executor.spin_until_future_complete(Future(), timeout_sec=0.05)
-        if not printed and all(heard.values()):
-            print(max(record[1] for record in heard.values()), flush=True)
-            printed = True
-    np.savez(file, *(np.array(record).reshape(-1, 2) for record in heard.values()))
+        executor.spin_until_future_complete(Future(), timeout_sec=seconds)
     executor.shutdown()
 
 
 def relay(kind: str, topic: str) -> None:
     """Publish each message unchanged; a sink drops it, a typed relay deserializes it."""
-    node = Node('relay')
+    node = enter('relay')
     out = node.create_publisher(Imu, topic, STREAM)
     callback = out.publish if kind != 'sink' else lambda data: None
-    executor = SingleThreadedExecutor() if kind == 'typed' else EventsExecutor()
-    node.create_subscription(Imu, 'imu/data_raw', callback, SENSOR, raw=kind != 'typed')
-    executor.add_node(node)
-    over = ended()
-    while not over():
-        executor.spin_until_future_complete(Future(), timeout_sec=0.25)
-    executor.shutdown()
+    node.create_subscription(Imu, IMU, callback, SENSOR, raw=kind != 'typed')
+    spin(node, SingleThreadedExecutor() if kind == 'typed' else EventsExecutor(), 0.25)
 
 
-def relay_command(kind: str, topic: str = 'imu/data_calibrated') -> list[str]:
-    """Return the command of a bare relay."""
-    return [__file__, 'relay', kind, topic]
+def ask(file: str) -> None:
+    """Call the self-test for each number on standard input until it answers; record the number."""
+    caller, record = Caller(), Record(Path(file))
+    for number in sys.stdin:
+        while not caller.call('self_test', SelfTest, 5.0).id:
+            pass
+        record.add(int(number), time.monotonic_ns())
+    caller.close()
+
+
+def client(program: str, *given: object) -> list[str]:
+    """Return the command of a program of this file."""
+    return [__file__, program, *map(str, given)]
 
 
 def node_command(*parameters: str) -> list[str]:
@@ -195,15 +243,14 @@ class Caller:
         while not over() and (left := until - time.monotonic()) > 0.0:
             self._executor.spin_once(timeout_sec=min(left, 0.1))
 
-    def call(self, name: str) -> Any:
-        """Call a service and return its response; without words none came."""
-        from std_srvs.srv import Trigger
+    def call(self, name: str, kind: Any = Trigger, seconds: float = 120.0) -> Any:
+        """Call a service and return its response; an empty one if none came within a time."""
         if name not in self._clients:
-            self._clients[name] = self.node.create_client(Trigger, f'calibrator/{name}')
+            self._clients[name] = self.node.create_client(kind, f'calibrator/{name}')
             self._clients[name].wait_for_service(10.0)
-        future = self._clients[name].call_async(Trigger.Request())
-        self._executor.spin_until_future_complete(future, timeout_sec=120.0)
-        return future.result() if future.done() else Trigger.Response()
+        future = self._clients[name].call_async(kind.Request())
+        self._executor.spin_until_future_complete(future, timeout_sec=seconds)
+        return future.result() if future.done() else kind.Response()
 
     def close(self) -> None:
         """Leave DDS."""
@@ -224,22 +271,22 @@ class Trial:
     heard: tuple[Stamps, ...]  # of each program, (m, 2) stamp and arrival of its messages [ns]
     log: str  # what the programs printed
 
-    def between(self, first: int, last: int) -> Trial:
+    def between(self, first: int, last: int) -> 'Trial':
         """Return the messages of a shorter interval."""
         sent, heard = self.sent, self.heard
         return replace(
             self, first=first, last=last, sent=sent[(sent >= first) & (sent < last)],
             heard=tuple(each[(each[:, 0] >= first) & (each[:, 0] < last)] for each in heard))
 
-    def latency_us(self, percent: float) -> float:
-        """Return a percentile of the time from driver to user of the first program [µs]."""
-        heard = self.heard[0]
-        return float(np.percentile((heard[:, 1] - heard[:, 0]) * 1e-3, percent))
+    def latency_us(self, percent: float, program: int = 0) -> float:
+        """Return a percentile of the time from driver to user [µs]; NaN without a message."""
+        heard = self.heard[program]
+        late = (heard[:, 1] - heard[:, 0]) * 1e-3
+        return float(np.percentile(late, percent)) if len(late) else np.nan
 
-    @property
-    def lost(self) -> int:
-        """Return the number of messages that the user did not receive of the first program."""
-        return len(self.sent) - len(np.unique(self.heard[0][:, 0]))
+    def lost(self, program: int = 0) -> int:
+        """Return the number of messages that the user did not receive of a program."""
+        return int(np.sum(~np.isin(self.sent, self.heard[program][:, 0])))
 
     @property
     def rate(self) -> float:
@@ -278,18 +325,26 @@ def run_trial(programs: Mapping[str, list[str]], rate: float,
     """
     with tempfile.TemporaryDirectory() as given, ExitStack() as stack:
         folder = Path(given)
-        os.environ.update(ROS_DOMAIN_ID=str(next(_DOMAINS)), PYTHONPATH=str(ROOT),
-                          ROS_LOG_DIR=given, ROS_HOME=given)
-        os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-        sent, heard, log = folder / 'sent.npy', folder / 'heard.npz', folder / 'log'
-        user = stack.enter_context(process([__file__, 'listen', str(heard), *programs]
-                                           if listened else [__file__, 'none'], log))
-        driver = stack.enter_context(process([__file__, 'drive', str(rate), str(sent)], log))
-        first_of(driver, log)
+        log, sent = folder / 'log', Record(folder / 'sent')
+        heard = {topic: folder / f'heard_{k}' for k, topic in enumerate(programs)}
+        records = [Record(file) for file in heard.values()]
+
+        def wait_for(*filled: Record) -> None:
+            if not wait_until(lambda: all(map(len, filled))):
+                raise RuntimeError(f'no messages after {PATIENCE:g} s: {log.read_text()}')
+
+        enter_domain(folder)
+        if listened:
+            files = [part for topic, file in heard.items() for part in (file, topic)]
+            stack.enter_context(process(client('listen', *files), log))
+        driver = stack.enter_context(prepare_driver(rate, folder / 'sent', log))
+        say(driver)
+        wait_for(sent)
         time.sleep(lead)
-        began = time.monotonic()
+        began = time.monotonic_ns()
         pids = [stack.enter_context(process(command, log)).pid for command in programs.values()]
-        start = first_of(user, log) * 1e-9 - began if listened else np.nan
+        if listened:
+            wait_for(*records)
         time.sleep(SETTLE if listened else 2.0 * SETTLE)
         cpu, first = cpu_seconds(pids[0]), time.monotonic_ns()
         during(*pids)
@@ -298,9 +353,17 @@ def run_trial(programs: Mapping[str, list[str]], rate: float,
         driver.communicate(timeout=60)  # first: a flooded process may not notice its end
         time.sleep(0.3)
         stack.close()
-        arrived = np.load(heard) if listened else {}
-        return Trial(first, last, start, cpu, np.load(sent), tuple(arrived.values()),
+        pairs = [record.pairs() for record in records] if listened else []
+        start = 1e-9 * (max(each[0, 1] for each in pairs) - began) if listened else np.nan
+        return Trial(first, last, start, cpu, sent.pairs()[:, 0], tuple(pairs),
                      log.read_text(encoding='utf-8')).between(first, last)
+
+
+def enter_domain(folder: Path) -> None:
+    """Give the processes that are started from now on a DDS domain and a folder of their own."""
+    os.environ.update(ROS_DOMAIN_ID=str(next(_DOMAINS)), PYTHONPATH=str(ROOT),
+                      ROS_LOG_DIR=str(folder), ROS_HOME=str(folder))
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 
 @contextmanager
@@ -309,7 +372,7 @@ def process(command: list[str], log: Path) -> Iterator[subprocess.Popen[str]]:
     own = command[0] == __file__
     with log.open('a') as printed:
         running = subprocess.Popen(
-            [sys.executable, *command], cwd=ROOT, text=True, stderr=printed,
+            [sys.executable, '-X', 'faulthandler', *command], cwd=ROOT, text=True, stderr=printed,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE if own else printed)
     try:
         yield running
@@ -320,28 +383,34 @@ def process(command: list[str], log: Path) -> Iterator[subprocess.Popen[str]]:
             running.communicate(timeout=60)
 
 
-def first_of(client: subprocess.Popen[str], log: Path) -> int:
-    """Wait for the first message of a client, and return its time [ns]."""
-    assert client.stdout is not None
-    if not select([client.stdout], [], [], PATIENCE)[0]:
-        raise RuntimeError(f'no messages after {PATIENCE:g} s: {log.read_text(encoding="utf-8")}')
-    return int(client.stdout.readline())
+@contextmanager
+def prepare_driver(rate: float, file: Path, log: Path) -> Iterator[subprocess.Popen[str]]:
+    """Run a driver that enters DDS as soon as a line is written to it."""
+    with process(client('drive', rate, file), log) as driver:
+        assert driver.stdout is not None
+        driver.stdout.readline()
+        yield driver
 
 
-def main() -> None:
-    """Run the process that the first argument names."""
-    what, *given = sys.argv[1:]
-    rclpy.init(args=[])
-    if what == 'drive':
-        drive(float(given[0]), Path(given[1]))
-    elif what == 'listen':
-        listen(Path(given[0]), *given[1:])
-    elif what == 'relay':
-        relay(*given)
-    else:
-        sys.stdin.read()
-    rclpy.try_shutdown()
+def say(program: subprocess.Popen[str], line: object = '') -> None:
+    """Write a line to the standard input of a program."""
+    assert program.stdin is not None
+    print(line, file=program.stdin, flush=True)
 
+
+def wait_until(over: Callable[[], object]) -> bool:
+    """Wait until something holds, at most `PATIENCE`; return whether it does."""
+    ends = time.monotonic() + PATIENCE
+    while not over():
+        if time.monotonic() > ends:
+            return False
+        time.sleep(0.002)
+    return True
+
+
+PROGRAMS: dict[str, Callable[..., None]] = {
+    'drive': drive, 'listen': listen, 'relay': relay, 'ask': ask}
 
 if __name__ == '__main__':
-    main()
+    PROGRAMS[sys.argv[1]](*sys.argv[2:])
+    rclpy.try_shutdown()

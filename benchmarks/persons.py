@@ -3,8 +3,6 @@
 
 """Persons who do what the guide says, as far as they can: how each of them ends, and when."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import os
 from tempfile import TemporaryDirectory

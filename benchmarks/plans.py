@@ -9,19 +9,17 @@ next plan; or at random. A set ends when one twin is certain, or after `MOST` po
 
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from accel_calib.calibration import PlannedPose
 from accel_calib.refinement import refine, Refinement, Step
 from accel_calib.table import Floats
-from accel_calib.units import units_of
 from figures import Frame, Line, table
 from generator import Around, measure, Setup, simulate, Simulated
 import numpy as np
-from sensors import poses_of, random_directions
+from sensors import simulated_poses
+from shared import MPS2, random_directions
 
 TWINS = (('quadratic', 'gain_asymmetry', 3.0, 'wandering'),
          ('cubic', 'odd_quadratic', 3.0, 'wandering'),
@@ -35,8 +33,6 @@ INTERVAL = 35.0
 """Usual time between poses [s]."""
 
 SUPPLY = 3.3
-
-Columns = dict[str, Floats]
 
 
 @dataclass(frozen=True)
@@ -53,63 +49,52 @@ class Outcome:
     length: int  # poses of the first plan
 
 
-def add_pose(made: Simulated, columns: Columns, up: Floats, temperature: float, wait: float,
-             rng: np.random.Generator) -> Columns:
+def add_pose(made: Simulated, up: Floats, temperature: float, wait: float,
+             rng: np.random.Generator) -> Simulated:
     """
-    Return the columns of the pose table with one more pose of the same sensor.
+    Return the poses of a sensor and one more in the pose table.
 
-    Parameters
-    ----------
-    made : Simulated
-        The sensor.
-    columns : dict of str to (n,) array
-        The pose table.
-    up : (3,) array
-        Direction that points up.
-    temperature, wait : float
-        Temperature [°C], and time since the last pose [s].
-    rng : numpy.random.Generator
-        Source of the noise.
+    `up` is the direction that points up, and `wait` the time since the last pose [s].
 
     """
     setup = replace(made.setup, poses=1)
     sigma = setup.noise_mg * 1e-3 * setup.shaking ** rng.uniform(size=(1, 3))
     shaking = rng.normal(size=(1, 3, setup.samples)) * sigma[:, :, np.newaxis]
-    elapsed, warm = columns['time'][-1:] + wait, np.array([temperature])
+    elapsed, warm = made.columns['time'][-1:] + wait, np.array([temperature])
     around = Around(up[np.newaxis], elapsed, warm, warm, np.zeros(1), np.array([SUPPLY]),
                     rng.normal(size=(1, 3)) * 0.002, shaking, sigma)
     one = measure(rng, setup, around, made.traits, made.values)
-    return {name: np.append(values, one.columns[name]) for name, values in columns.items()}
+    return replace(made, columns={name: np.append(values, one.columns[name])
+                                  for name, values in made.columns.items()})
 
 
-def add_planned(made: Simulated, columns: Columns, pose: PlannedPose, wait: float,
-                rng: np.random.Generator) -> Columns:
+def add_planned(made: Simulated, pose: PlannedPose, wait: float, rng: np.random.Generator
+                ) -> Simulated:
     """Add a planned pose; what the plan leaves open is as usual."""
-    temperature = pose.context.get('temperature', float(columns['temperature'][-1]))
-    return add_pose(made, columns, np.array(pose.up), temperature, max(wait, INTERVAL), rng)
+    temperature = pose.context.get('temperature', float(made.columns['temperature'][-1]))
+    return add_pose(made, np.array(pose.up), temperature, max(wait, INTERVAL), rng)
 
 
-def refine_table(made: Simulated, columns: Mapping[str, Floats], twins: Sequence[str]
-                 ) -> tuple[Refinement, Step | None]:
-    """Return the refinement of a pose table, and its step that names one of the twins."""
-    found = refine(poses_of(replace(made, columns=columns)), units_of('m/s2'), base='10')
+def refine_set(made: Simulated, twins: Sequence[str]) -> tuple[Refinement, Step | None]:
+    """Return the refinement of the poses, and its step that names one of the twins."""
+    found = refine(simulated_poses(made), MPS2, base='10')
     return found, next((step for step in found.steps if step.effect in twins), None)
 
 
 def take_poses(made: Simulated, twins: Sequence[str], rng: np.random.Generator, *, by_plan: bool
                ) -> tuple[float, bool]:
     """Return the number of poses until one of the twins is certain, and whether it is right."""
-    columns, known = dict(made.columns), made.columns['temperature']
+    known = made.columns['temperature']
     for count in range(MOST + 1):
-        found, step = refine_table(made, columns, twins)
+        found, step = refine_set(made, twins)
         if step is not None and step.data_probabilities[step.effect] >= CERTAIN:
             return count, step.effect in made.truth
         up, warm = random_directions(1, rng)[0], float(rng.uniform(np.min(known), np.max(known)))
         if by_plan and found.plan.poses:
             first = found.plan.poses[0]
-            columns = add_planned(made, columns, first, first.context.get('time', 0.0), rng)
+            made = add_planned(made, first, first.context.get('time', 0.0), rng)
         else:
-            columns = add_pose(made, columns, up, warm, INTERVAL, rng)
+            made = add_pose(made, up, warm, INTERVAL, rng)
     return np.inf, False
 
 
@@ -119,19 +104,19 @@ def run_set(index: int, seed: int, number: int) -> Outcome | None:
     hidden, twins = (first, second)[number % 2], (first, second)
     made = simulate(np.random.default_rng((seed, index, number)), {hidden: size},
                     Setup(poses=24, rates='small', temperature=course))
-    found, step = refine_table(made, made.columns, twins)
+    found, step = refine_set(made, twins)
     if step is None or not {*twins} <= {step.effect, *step.rivals} or (
             max(step.data_probabilities.values()) >= CERTAIN or not found.plan.poses):
         return None
     rngs = [np.random.default_rng((seed, index, number, k)) for k in (1, 2, 3)]
     planned = take_poses(made, twins, rngs[0], by_plan=True)
     random = take_poses(made, twins, rngs[1], by_plan=False)
-    columns, waited = dict(made.columns), 0.0
+    waited = 0.0
     for pose in found.plan.poses:
         wait = max(pose.context.get('time', 0.0) - waited, INTERVAL)
         waited += wait
-        columns = add_planned(made, columns, pose, wait, rngs[2])
-    after = refine_table(made, columns, twins)[1]
+        made = add_planned(made, pose, wait, rngs[2])
+    after = refine_set(made, twins)[1]
     return Outcome(*planned, *random, step.data_probabilities[hidden],
                    found.plan.poses[-1].expected,
                    after.data_probabilities.get(hidden, 0.0) if after else 0.0,

@@ -3,26 +3,24 @@
 
 """Which poses a fit needs: poor geometry, and the order in which poses are asked for."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 import re
 
 from accel_calib.calibration import directions_of, fit_poses, next_pose as next_asked
-from accel_calib.effects import predict, sensor_force, simulate_poses
+from accel_calib.effects import Model, model_with, predict, sensor_force, simulate_poses
 from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import closed_form, estimate, pose_noise, start_of
 from accel_calib.geometry import ATTITUDES, spread_directions, unit
-from accel_calib.table import Floats, Poses
+from accel_calib.table import concatenated, Floats, Poses
 from accel_calib.units import units_of
-from figures import Frame, Line, markdown, table
+from figures import check, Frame, Line, markdown, share, table
 import numpy as np
-from sensors import draw_model, FACES, join, length_error_mg, random_directions, tilt
+from sensors import length_error_mg, tilt
+from shared import FACES, poses_of, random_directions
 
 G = units_of('g')
 COUNT = 12
-MODELS = ('4', '7', '9', '10', '12')
 FAR = 10.0
 """An error of |a| that nobody accepts: twice that of leaving out the cross-axis gains [mg]."""
 
@@ -45,7 +43,6 @@ class Outcome:
     """The result of a set; errors are RMS errors of |a| [mg], NaN if there is no fit."""
 
     refused: bool  # for model 10
-    determined: tuple[bool, ...]  # whether each model of `MODELS` is fitted
     error: float  # of model 10, or of the smaller model that the refusal offers
     forced: float  # of model 10, fitted even if it is refused; infinite if that fails
     offered: str = ''  # the smaller model that the refusal offers, if any
@@ -123,27 +120,36 @@ def named_directions(advice: str) -> Floats:
     return unit(np.array(found).reshape(-1, 3))
 
 
+def draw_model(rng: np.random.Generator) -> Model:
+    """Draw a sensor with offset, gains and cross-axis gains."""
+    sizes = {'offset': 0.03, 'axis_gain': 0.02, 'cross_axis': 0.01}
+    return model_with({name: rng.normal(size=3) * size for name, size in sizes.items()})
+
+
+def add_poses(poses: Poses | None, model: Model, directions: Floats, rng: np.random.Generator
+              ) -> Poses:
+    """Return poses with more of the same sensor."""
+    more = simulate_poses(model, directions, rng)
+    return more if poses is None else poses_of(**concatenated([poses, more]).columns)
+
+
 def fit_set(name: str, seed: int, number: int) -> Outcome:
     """Draw a set and fit it."""
     rng = np.random.default_rng([seed, number])
     model = draw_model(rng)
     reading = predict(model, random_directions(500, rng), {})
-    directions = CASES[name][0](rng)
-    poses = simulate_poses(model, directions, rng)
+    poses = add_poses(None, model, CASES[name][0](rng), rng)
     forced = force_fit(poses, reading)
-    known = poses.with_columns(reference=directions)
-    determined = tuple(not np.isnan(fit(known if model == '12' else poses, reading, model))
-                       for model in MODELS)
     try:
         found = length_error_mg(fit_poses(poses, G, model='10').correct(reading))
-        return Outcome(False, determined, found, forced)
+        return Outcome(False, found, forced)
     except RefusedFitError as refusal:
         more = named_directions(refusal.advice)
         offer = re.search(r'or use model (\d+)', refusal.advice)
         offered = offer.group(1) if offer else ''
-        again = join(poses, simulate_poses(model, tilt(more, 5.0, rng), rng))
-        return Outcome(True, determined, fit(poses, reading, offered) if offered else np.nan,
-                       forced, offered, len(more), fit(again, reading, '10'))
+        again = add_poses(poses, model, tilt(more, 5.0, rng), rng)
+        return Outcome(True, fit(poses, reading, offered) if offered else np.nan, forced, offered,
+                       len(more), fit(again, reading, '10'))
 
 
 def median(values: Sequence[float]) -> str:
@@ -165,19 +171,17 @@ def row_of(name: str, outcomes: Sequence[Outcome]) -> list[str]:
 def lines_of(found: dict[str, list[Outcome]]) -> Iterator[Line]:
     """Yield what is asked of each case, and of all sets."""
     for name, outcomes in found.items():
-        share, refused = CASES[name][1], np.mean([each.refused for each in outcomes])
-        if share is not None:
-            yield Line(f'{name}: refused for model 10', f'{refused:.1%}', len(outcomes),
-                       f'{100.0 * share:g} %', bool(refused == share))
+        asked = CASES[name][1]
+        if asked is not None:
+            yield share(f'{name}: refused for model 10', (each.refused for each in outcomes),
+                        least=100.0 * asked, most=100.0 * asked)
     everything = [each for outcomes in found.values() for each in outcomes]
-    far = [each.refused for each in everything if each.forced > FAR]
-    out = [each.with_added <= 0.6 for each in everything if each.refused]
     kept = [each.error for each in everything if not each.refused]
-    yield Line(f'all sets whose fit would be wrong by more than {FAR:g} mg: refused',
-               f'{np.mean(far):.2%}', len(far), '100 %', all(far))
+    yield share(f'all sets whose fit would be wrong by more than {FAR:g} mg: refused',
+                (each.refused for each in everything if each.forced > FAR), least=100.0)
     yield Line('all sets fitted: error of the norm, median (worst) [mg]', median(kept), len(kept))
-    yield Line('all sets refused: within 0.6 mg once the poses named are added',
-               f'{np.mean(out):.1%}', len(out))
+    yield share('all sets refused: within 0.6 mg once the poses named are added',
+                (each.with_added <= 0.6 for each in everything if each.refused))
 
 
 def geometry(frame: Frame, sets: int = 200, seed: int = 1) -> Iterator[str]:
@@ -186,9 +190,6 @@ def geometry(frame: Frame, sets: int = 200, seed: int = 1) -> Iterator[str]:
     found = {name: outcomes[k * sets:(k + 1) * sets] for k, name in enumerate(CASES)}
     yield table(lines_of(found))
     yield markdown(HEADS, [row_of(*each) for each in found.items()])
-    yield markdown(('refused for model', *MODELS), (
-        (name, *(f'{1.0 - share:.1%}' for share in np.mean(
-            [each.determined for each in outcomes], axis=0))) for name, outcomes in found.items()))
 
 
 Order = Callable[[Poses | None, int, np.random.Generator], Floats]
@@ -223,7 +224,7 @@ def take(name: str, seed: int, number: int) -> tuple[list[float], float]:
     Returns
     -------
     list of float
-        RMS error of |a| on fresh directions from `FEWEST` poses on [mg]; infinite if the fit is
+        RMS error of |a| on fresh directions from `FEWEST` poses on [mg]; NaN if the fit is
         refused.
     float
         Number of poses at which the node asks for no more; infinite if it always asks.
@@ -236,14 +237,9 @@ def take(name: str, seed: int, number: int) -> tuple[list[float], float]:
     for count in range(MOST):
         direction = order(poses, count, rng)[np.newaxis]
         direction = tilt(direction, OFF, rng) if by_hand else direction
-        one = simulate_poses(model, direction, rng)
-        poses = one if poses is None else join(poses, one)
+        poses = add_poses(poses, model, direction, rng)
         if count + 1 >= FEWEST:
-            try:
-                fitted = fit_poses(poses, G, model='10')
-                errors.append(length_error_mg(fitted.correct(predict(model, fresh, {}))))
-            except RefusedFitError:
-                errors.append(np.inf)
+            errors.append(fit(poses, predict(model, fresh, {}), '10'))
             if next_asked(directions_of(poses, G), '10').direction is None:
                 enough = min(enough, count + 1)
     return errors, enough
@@ -253,27 +249,19 @@ def next_pose(frame: Frame, sets: int = 200, seed: int = 1) -> Iterator[str]:
     lines, needed, rows = [], {}, []
     for name, (order, _) in ORDERS.items():
         found = frame.run_sets(take, sets, name, seed)
-        medians = np.median([errors for errors, _ in found], axis=0)
+        medians = np.median(np.nan_to_num([errors for errors, _ in found], nan=np.inf), axis=0)
         above = FEWEST + np.flatnonzero(~(medians <= AIM))
         needed[name] = FEWEST if len(above) == 0 else int(above[-1]) + 1
         rows.append((name, *(f'{medians[count - FEWEST]:.3f}' for count in SHOWN)))
-        lines.append(Line(f'poses to {AIM} mg, {name}', words_of(needed[name]), sets))
+        words = f'over {MOST}' if needed[name] > MOST else str(needed[name])
+        lines.append(check(
+            f'poses to {AIM} mg, {name}', words, needed[name], sets=sets,
+            least=-np.inf if order is as_asked else needed['as asked, held 10° off'] + 1))
         if order is as_asked:
             enough = np.array([count for _, count in found])
             there = [errors[int(min(count, MOST)) - FEWEST] for errors, count in found]
             lines.append(Line(f'poses when the node asks for no more, {name}',
                               f'{np.median(enough):.0f} ({np.min(enough):.0f} to '
                               f'{np.max(enough):.0f}), {np.median(there):.3f} mg', sets))
-    ours = needed['as asked, held 10° off']
-    for name in ('random directions', 'random among the 26, held 10° off',
-                 'faces, edges, corners, held 10° off'):
-        lines.append(Line(f'poses to {AIM} mg: as asked, held 10° off, instead of {name}',
-                          f'{words_of(ours)} instead of {words_of(needed[name])}', sets,
-                          'fewer', ours < needed[name]))
     yield table(lines)
     yield markdown(('poses', *SHOWN), rows)
-
-
-def words_of(count: int) -> str:
-    """Return a number of poses as text."""
-    return f'over {MOST}' if count > MOST else str(count)

@@ -14,8 +14,6 @@ or above, on sets that nothing was tuned with. All rows take an hour or two.
 
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,13 +27,12 @@ from accel_calib.refinement import refine as refine_poses
 from accel_calib.statistics import rms
 from accel_calib.table import Poses
 from accel_calib.units import MG, units_of
-from figures import Frame, Line, markdown, table, tell
+from figures import check, Frame, Line, markdown, share, table, tell
 from generator import again, ON_OUTPUT, simulate, Simulated
 import numpy as np
 from refine_sets import (
     ALIKE, ALONE, Case, cases_of, GROUPS, LOST, NOTHING, ROWS, true_form_error_mg)
-from scipy.stats import binomtest
-from sensors import poses_of
+from sensors import simulated_poses
 
 MS2 = units_of('m/s2')
 BASE = ('offset', 'gain', 'axis_gain', 'cross_axis', 'misalignment')
@@ -145,14 +142,14 @@ def run_case(case: Case) -> Outcome:
     """Simulate the poses of a case, refine them and judge the result."""
     made = simulate(np.random.default_rng(case.seed), case.hidden, case.setup)
     knocked = {row: abs(shown) / made.noise[row - 1] for row, shown in made.knocked.items()}
-    poses = with_columns(poses_of(made), case, 2)
+    poses = with_columns(simulated_poses(made), case, 2)
     started = time.process_time()
     try:
         refined: Any = refine_poses(poses, MS2, base=case.group.base)
         seconds = time.process_time() - started
         other = again(np.random.default_rng((*case.seed, 1)), made)
         base = fit_poses(poses, MS2, model=case.group.base)
-        fresh = with_columns(poses_of(other), case, 3)
+        fresh = with_columns(simulated_poses(other), case, 3)
         used = base if refined.refusal else refined.calibration
         return Outcome(
             case, refined.verdict, seconds, knocked,
@@ -220,8 +217,8 @@ def is_said(step: Any) -> tuple[bool, bool, bool]:
 # --------------------------------------------------------------------------------- what is counted
 
 Outcomes = Sequence[Outcome]
-Check = tuple[str, Callable[[Outcome], bool], float | None, float | None]
-"""What is counted, the condition, and the smallest and the largest share that are asked."""
+Check = tuple[str, Callable[[Outcome], bool], Mapping[str, float]]
+"""What is counted, the condition, and the limits of its share [%], as `share` takes them."""
 
 
 def judge(*words: str) -> Callable[[Outcome], bool]:
@@ -277,46 +274,33 @@ def keeps_poses(outcome: Outcome) -> bool:
     return outcome.disturbed <= set(outcome.knocked) and outcome.verdict != 'error'
 
 
-TITLES = {
-    **dict.fromkeys(NOTHING, 'nothing hidden'), 'two': 'two effects',
-    **dict.fromkeys(OUTSIDE_ROWS, 'outside the catalogue'),
-    'rising': 'temperature rises with time', 'missing': 'column missing',
-    'knocked': 'three knocked in 60', 'small': 'too small to be seen', 'faint': 'one effect',
-    'few': 'one effect', 'three': 'three effects',
-    'knocked_and_one': 'one effect of size 5', 'lag': 'temperature with a lag of 30 to 300 s',
-    'curved': 'offset linear and quadratic in temperature, size 5',
-    'chamber': 'offset and gain over temperature, and warm-up, size 5',
-    'sign': 'hysteresis by the sign of the motion, size 3', 'spoiled': 'nothing hidden',
-    'flicker': '1/f noise of the offset', 'large': 'two effects',
-    'columns': 'one effect of an unknown column', 'noise_columns': 'nothing hidden',
-    'memory': 'what turns leave, size 3'}
+RIGHT = {'faint': (88.0, 97.0), 'few': (65.0, 85.0, -np.inf), 'three': (90.0, 97.5, 97.5),
+         'knocked_and_one': (95.0, 93.0, 90.0, 60.0), 'curved': (95.0,), 'chamber': (90.0,),
+         'sign': (95.0,), 'large': (99.5,), 'two': (95.0,), 'rising': (95.0,),
+         'columns': (95.0, 95.0), 'memory': (95.0, 95.0)}
+"""Share of sets with the right names that is asked, by group [%]."""
 
-RIGHT = {'faint': (0.88, 0.97), 'few': (0.65, 0.85, None), 'three': (0.9, 0.975, 0.975),
-         'knocked_and_one': (0.95, 0.93, 0.9, 0.6), 'curved': (0.95,), 'chamber': (0.9,),
-         'sign': (0.95,), 'large': (0.995,), 'two': (0.95,), 'rising': (0.95,),
-         'columns': (0.95, 0.95), 'memory': (0.95, 0.95)}
-"""Share of sets with the right names that is asked, by group."""
+KNOCKS: tuple[Check, ...] = (('all that show found', finds_knocks, {}),
+                             ('no clean pose left out', keeps_poses, {}))
 
 CHECKS: dict[str, tuple[Check, ...]] = {
     **dict.fromkeys((*NOTHING, 'spoiled', 'noise_columns'), (
-        ('a name', lambda o: bool(o.named), None, 0.02),
-        ('an empirical term', lambda o: bool(o.terms), None, 0.02),
-        ('verdict no_gap', lambda o: o.verdict == 'no_gap', None, None))),
-    'missing': (('reported as not understood', is_honest, None, None),
-                ('another name', has_another_name, None, 0.0)),
+        ('a name', lambda o: bool(o.named), {'most': 2.0}),
+        ('an empirical term', lambda o: bool(o.terms), {'most': 2.0}),
+        ('verdict no_gap', lambda o: o.verdict == 'no_gap', {}))),
+    'missing': (('reported as not understood', is_honest, {}),
+                ('another name', has_another_name, {'most': 0.0})),
     'knocked': (
         ('all found, no clean one, no name',
-         lambda o: finds_knocks(o) and keeps_poses(o) and not o.named, 0.95, None),
-        ('all that show found', finds_knocks, None, None),
-        ('no clean pose left out', keeps_poses, None, None),
-        ('no effect named', lambda o: not o.named, None, None)),
-    'small': (('no_gap', lambda o: o.verdict == 'no_gap', 0.95, None),
-              ('a wrong name', is_wrong, None, None)),
-    'flicker': (('a wrong name', has_another_name, None, 0.05),
-                ('verdict described', is_described, None, None)),
+         lambda o: finds_knocks(o) and keeps_poses(o) and not o.named, {'least': 95.0}),
+        *KNOCKS, ('no effect named', lambda o: not o.named, {})),
+    'small': (('no_gap', lambda o: o.verdict == 'no_gap', {'least': 95.0}),
+              ('a wrong name', is_wrong, {})),
+    'flicker': (('a wrong name', has_another_name, {'most': 5.0}),
+                ('verdict described', is_described, {})),
     **dict.fromkeys(OUTSIDE_ROWS, (
-        ('reported as not understood', is_honest, 0.95, None),
-        ('verdict described', is_described, None, None)))}
+        ('reported as not understood', is_honest, {'least': 95.0}),
+        ('verdict described', is_described, {})))}
 
 
 def checks_of(row: str, index: int) -> tuple[Check, ...]:
@@ -325,61 +309,42 @@ def checks_of(row: str, index: int) -> tuple[Check, ...]:
         return (('offset_temperature named, lag within 10 %', lambda o: (
                     o.names == ('offset_temperature',) and o.lag is not None
                     and abs(abs(o.lag / o.case.setup.lag) - 1.0) <= LAG_WITHIN),
-                 0.95 if index % 2 == 0 else None, None),
+                 {'least': 95.0} if index % 2 == 0 else {}),
                 ('offset_temperature and no other name',
-                 lambda o: o.names == ('offset_temperature',), None, None))
+                 lambda o: o.names == ('offset_temperature',), {}))
     if row not in RIGHT:
         return CHECKS[row]
-    wrong = 0.01 if row == 'faint' else 0.05 if (row, index) == ('knocked_and_one', 3) else None
-    knocks: tuple[Check, ...] = (('all that show found', finds_knocks, None, None),
-                                 ('no clean pose left out', keeps_poses, None, None))
-    return (('right or rival', is_right, RIGHT[row][index], None),
-            ('exact', is_exact, None, None), ('a wrong name', is_wrong, None, wrong),
-            *(knocks if row == 'knocked_and_one' else ()))
+    wrong = 1.0 if row == 'faint' else 5.0 if (row, index) == ('knocked_and_one', 3) else np.inf
+    return (('right or rival', is_right, {'least': RIGHT[row][index]}),
+            ('exact', is_exact, {}), ('a wrong name', is_wrong, {'most': wrong}),
+            *(KNOCKS if row == 'knocked_and_one' else ()))
 
 
 # ------------------------------------------------------------------------------------------- lines
 
-def share_line(what: str, outcomes: Outcomes, good: Callable[[Outcome], bool],
-               least: float | None = None, most: float | None = None) -> Line:
-    """Return a line with the share of good outcomes, its count and its interval [%]."""
-    if not outcomes:
-        return Line(what, 'no set', 0)
-    count = sum(map(good, outcomes))
-    part, limits = count / len(outcomes), binomtest(count, len(outcomes)).proportion_ci()
-    text = (f'{100.0 * part:.1f} % ({count}/{len(outcomes)}; {100.0 * limits.low:.1f} to '
-            f'{100.0 * limits.high:.1f})')
-    if least is not None:
-        return Line(what, text, len(outcomes), f'≥ {100.0 * least:g} %', part >= least)
-    return Line(what, text, len(outcomes), '' if most is None else f'≤ {100.0 * most:g} %',
-                None if most is None else part <= most)
-
-
 def lines_of(row: str, outcomes: Outcomes) -> Iterator[Line]:
-    if row in ALONE:
-        yield from lines_of_one('one effect, {} poses, size {:g}'.format(*ALONE[row]), outcomes)
-        return
     for index, group in enumerate(GROUPS[row]):
-        chosen = [o for o in outcomes if o.case.index == index]
-        what = ', '.join(filter(None, (TITLES.get(row, ''), group.what)))
-        for words, *check in checks_of(row, index):
-            yield share_line(f'{what}: {words}', chosen, *check)  # type: ignore[arg-type]
+        what, chosen = group.what, [o for o in outcomes if o.case.index == index]
+        if row in ALONE:
+            yield from lines_of_one(what, chosen)
+            continue
+        for words, is_good, limits in checks_of(row, index):
+            yield share(f'{what}: {words}', map(is_good, chosen), **limits)
         if row in OUTSIDE_ROWS:
             known = [o for o in chosen if o.truths]
-            yield share_line(f'{what}: carrier and variable right', known, lambda o: o.located)
-            yield share_line(
-                f'{what}: carrier and variable right, of those with an empirical term',
-                [o for o in known if o.terms], lambda o: o.located)
+            yield share(f'{what}: carrier and variable right', (o.located for o in known))
+            yield share(f'{what}: carrier and variable right, of those with an empirical term',
+                        (o.located for o in known if o.terms))
             for kind in sorted({name for o in chosen for name in o.case.hidden}):
-                yield share_line(f'{what}, {kind}: reported as not understood',
-                                 [o for o in chosen if kind in o.case.hidden], is_honest, 0.95)
+                yield share(f'{what}, {kind}: reported as not understood',
+                            (is_honest(o) for o in chosen if kind in o.case.hidden), least=95.0)
         if row == 'lag' or row in OUTSIDE_ROWS:
             yield from lines_of_fresh(what, chosen, 1.2 if row == 'lag' and index % 2 == 0
-                                      else None, harmless=row != 'lag')
+                                      else np.inf, harmless=row != 'lag')
         yield seconds_line(what, chosen)
 
 
-def lines_of_fresh(what: str, outcomes: Outcomes, most: float | None = None, *,
+def lines_of_fresh(what: str, outcomes: Outcomes, most: float = np.inf, *,
                    harmless: bool = True) -> Iterator[Line]:
     """
     Yield the lines of the errors of fresh poses.
@@ -393,21 +358,19 @@ def lines_of_fresh(what: str, outcomes: Outcomes, most: float | None = None, *,
         return
     base, refined, noise = each.T
     worst, over = float(np.max(refined / base)), rms(refined / noise)
-    yield Line(f'{what}: largest fresh error over that of the base',
-               f'{worst:.3f}, above {WORSE} in {np.sum(refined > WORSE * base)}', len(each),
-               f'≤ {WORSE}' if harmless else '', worst <= WORSE if harmless else None)
-    yield Line(f'{what}: fresh error over the noise of a pose',
-               f'{rms(base / noise):.2f} → {over:.2f} (95 % of sets below '
-               f'{np.percentile(refined / noise, 95.0):.2f})', len(each),
-               '' if most is None else f'≤ {most:g}', None if most is None else over <= most)
+    yield check(f'{what}: largest fresh error over that of the base',
+                f'{worst:.3f}, above {WORSE} in {np.sum(refined > WORSE * base)}', worst,
+                most=WORSE if harmless else np.inf, sets=len(each))
+    yield check(f'{what}: fresh error over the noise of a pose',
+                f'{rms(base / noise):.2f} → {over:.2f} (95 % of sets below '
+                f'{np.percentile(refined / noise, 95.0):.2f})', over, most=most, sets=len(each))
 
 
-def seconds_line(what: str, outcomes: Outcomes, most: float | None = None) -> Line:
+def seconds_line(what: str, outcomes: Outcomes, most: float = np.inf) -> Line:
     seconds = np.array([o.seconds for o in outcomes] or [np.nan])
     middle = float(np.median(seconds))
-    return Line(f'{what}: CPU seconds per set', f'{middle:.2f}, longest {np.max(seconds):.2f}',
-                len(outcomes), '' if most is None else f'< {most:g}',
-                None if most is None else middle < most)
+    return check(f'{what}: CPU seconds per set', f'{middle:.2f}, longest {np.max(seconds):.2f}',
+                 middle, most=most, sets=len(outcomes))
 
 
 def lines_of_one(what: str, outcomes: Outcomes) -> Iterator[Line]:
@@ -415,30 +378,27 @@ def lines_of_one(what: str, outcomes: Outcomes) -> Iterator[Line]:
     families = set().union(*ALIKE[:2])
     alike = [o for o in outcomes if families & set(o.case.hidden)]
     clear = [o for o in outcomes if not families & set(o.case.hidden)]
-    yield share_line(f'{what}: exact', outcomes, is_exact)
-    yield share_line(f'{what}: exact, without look-alikes', clear, is_exact, least=0.97)
-    yield share_line(f'{what}: look-alikes right or rival', alike, is_right, least=0.98)
-    yield share_line(f'{what}: look-alikes exact', alike, is_exact)
-    yield share_line(f'{what}: wrong and no rival', outcomes, is_wrong, most=0.01)
-    yield share_line(f'{what}: missed', outcomes, judge('missed'))
-    yield share_line(f'{what}: right and verdict explained', outcomes,
-                     lambda o: is_right(o) and o.verdict == 'explained')
+    yield share(f'{what}: exact', map(is_exact, outcomes))
+    yield share(f'{what}: exact, without look-alikes', map(is_exact, clear), least=97.0)
+    yield share(f'{what}: look-alikes right or rival', map(is_right, alike), least=98.0)
+    yield share(f'{what}: look-alikes exact', map(is_exact, alike))
+    yield share(f'{what}: wrong and no rival', map(is_wrong, outcomes), most=1.0)
+    yield share(f'{what}: missed', map(judge('missed'), outcomes))
+    yield share(f'{what}: right and verdict explained',
+                (is_right(o) and o.verdict == 'explained' for o in outcomes))
     fitted = [o for o in outcomes if o.true_mg is not None]
     for group, chosen in (('all', fitted),
                           ('where the name is right', list(filter(is_right, fitted)))):
         if chosen:
             refined, true = np.array([(o.fresh[1], o.true_mg) for o in chosen]).T
             pooled = rms(refined) / rms(true)
-            yield Line(f'{what}: held-out residual over that of the true form, {group}',
-                       f'{pooled:.3f} (95 % of sets below '
-                       f'{np.percentile(refined / true, 95.0):.3f})', len(chosen), '≤ 1.05',
-                       pooled <= 1.05)
+            yield check(f'{what}: held-out residual over that of the true form, {group}',
+                        f'{pooled:.3f} (95 % of sets below '
+                        f'{np.percentile(refined / true, 95.0):.3f})', pooled, most=1.05,
+                        sets=len(chosen))
     off = np.abs([value for o in outcomes for value in o.deviations])
     if len(off):
-        inside = float(np.mean(off < 3.0))
-        yield Line(f'{what}: parameters inside 3 standard deviations',
-                   f'{100.0 * inside:.1f} % of {len(off)}', len(outcomes), '≥ 99 %',
-                   inside >= 0.99)
+        yield share(f'{what}: parameters inside 3 standard deviations', off < 3.0, least=99.0)
     yield seconds_line(what, outcomes, 1.0)
 
 
@@ -447,12 +407,11 @@ def lines_of_all(outcomes: Outcomes) -> Iterator[Line]:
     for place, what in enumerate(('the named effect is the most probable of its list',
                                   'the held-out residual falls',
                                   'the instant in words is that of the values')):
-        good = [each[place] for o in outcomes for each in o.said]
-        yield Line(f'steps: {what}', f'{sum(good)} of {len(good)}', len(good), '100 %', all(good))
+        yield share(f'steps: {what}', (each[place] for o in outcomes for each in o.said),
+                    least=100.0)
     off = np.abs([value for o in outcomes if is_right(o) for value in o.deviations])
-    inside = 100.0 * float(np.mean(off < 1.96)) if len(off) else np.nan
-    yield Line('values of right names: 95 % intervals hold the truth',
-               f'{inside:.1f} % of {len(off)}', len(off), '93 to 97 %', 93.0 <= inside <= 97.0)
+    yield share('values of right names: 95 % intervals hold the truth', off < 1.96, least=93.0,
+                most=97.0)
     for poses in (12, 24, 60):
         yield from list(lines_of_fresh(f'{poses} poses, all rows', [
             o for o in outcomes if o.case.setup.poses == poses]))[:1]
@@ -466,7 +425,7 @@ def rows_of_effects(outcomes: Outcomes) -> Iterator[tuple[object, ...]]:
     for o in outcomes:
         names = 'random' if o.case.group.drawn else ' + '.join(sorted(o.case.hidden)) or 'nothing'
         kinds.setdefault((ROWS.index(o.case.row), o.case.group.what, names), []).append(o)
-    for (row, what, names), group in sorted(kinds.items(), key=lambda each: each[0]):
+    for (_, what, names), group in sorted(kinds.items(), key=lambda each: each[0]):
         counts = Counter(o.judgement for o in group)
         left_out = sum(len(o.disturbed - set(o.knocked)) for o in group) / len(group)
         off = np.abs([value for o in group for value in o.deviations])
@@ -474,7 +433,7 @@ def rows_of_effects(outcomes: Outcomes) -> Iterator[tuple[object, ...]]:
         terms = [o for o in group if o.terms]
         known = any(CARRIER[name] for o in terms for name in o.case.hidden)
         fresh = np.array([o.fresh for o in group if o.fresh])
-        yield (', '.join(filter(None, (ROWS[row], what))), names, len(group),
+        yield (what, names, len(group),
                *(counts[word] for word in ('exact', 'rival', 'wrong', 'missed', 'error')),
                f'{left_out:.1f}', f'{np.sum(off < 3.0)}/{len(off)}' if len(off) else '',
                f'{rms(fitted[:, 0]) / rms(fitted[:, 1]):.2f}' if len(fitted) else '',

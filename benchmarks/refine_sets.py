@@ -13,8 +13,6 @@ weights, beginning at the truth. It searches nothing, so it names nothing wrongl
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
@@ -55,7 +53,7 @@ Kind = tuple[dict[str, float], Setup]
 class Group:
     """Sets of a row that are counted together."""
 
-    what: str  # empty if the row has only one group
+    what: str
     # Random generator -> hidden effects and settings of one set of each kind.
     draw: Callable[[np.random.Generator], list[Kind]]
     drawn: bool = False  # whether the effects are random, and the kinds counted together
@@ -81,9 +79,9 @@ class Case:
         return GROUPS[self.row][self.index]
 
 
-def hide_each(names: tuple[str, ...], size: float, setup: Setup = Setup()) -> Group:
+def hide_each(title: str, names: tuple[str, ...], size: float, setup: Setup = Setup()) -> Group:
     """Return a group with one set per effect."""
-    return Group(f'{setup.poses} poses, size {size:g}',
+    return Group(f'{title}, {setup.poses} poses, size {size:g}',
                  lambda rng: [({name: size}, setup) for name in names])
 
 
@@ -116,36 +114,44 @@ def hide_lag(what: str, sign: float, size: float) -> Group:
     return Group(what, draw)
 
 
+ONE, OUT, TURNS = 'one effect', 'outside the catalogue', 'what turns leave, size 3'
+SCATTER = 'scatter of {:g} times the noise, which differs 30 times, {} poses'
+
 GROUPS: dict[str, tuple[Group, ...]] = {
-    **{row: (hide_each(CATALOGUE, size, Setup(poses=poses)),)
+    **{row: (hide_each(ONE, CATALOGUE, size, Setup(poses=poses)),)
        for row, (poses, size) in ALONE.items()},
-    **{row: (hide(f'{poses} poses', {}, Setup(poses=poses)),) for row, poses in NOTHING.items()},
-    'two': (hide_drawn('60 poses, size 5', (5.0, 5.0)),),
-    'outside': (hide_each(OUTSIDE, 3.0),),
-    'rising': (hide_each(('offset_temperature', 'offset_drift', 'warm_up'), 3.0,
+    **{row: (hide(f'nothing hidden, {poses} poses', {}, Setup(poses=poses)),)
+       for row, poses in NOTHING.items()},
+    'two': (hide_drawn('two effects, 60 poses, size 5', (5.0, 5.0)),),
+    'outside': (hide_each(OUT, OUTSIDE, 3.0),),
+    'rising': (hide_each('temperature rises with time',
+                         ('offset_temperature', 'offset_drift', 'warm_up'), 3.0,
                          Setup(temperature='rising')),),
-    'missing': (Group('', lambda rng: [({name: 3.0}, Setup(dropped=lost))
-                                       for name, lost in LOST.items()]),),
-    'knocked': (Group('', lambda rng: [({}, Setup(knocked=3))] * 3),),
-    'small': (hide_each(tuple(name for name in CATALOGUE if name not in ON_OUTPUT), 0.3),),
-    'faint': tuple(hide_each(CATALOGUE, size, Setup(poses=24)) for size in (1.5, 2.0)),
-    'few': (*(hide_each(CATALOGUE, size, Setup(poses=16)) for size in (3.0, 5.0)),
-            replace(hide_each(CATALOGUE, 8.0, Setup(poses=12)), base='auto')),
-    'three': (hide_drawn('60 poses, size 3', (3.0,) * 3),
-              hide_drawn('60 poses, size 5', (5.0,) * 3),
-              hide_drawn('100 poses, size 3', (3.0,) * 3, Setup(poses=100))),
-    'knocked_and_one': (
-        *(hide_drawn(f'{count} knocked of 60', (5.0,), Setup(knocked=count))
-          for count in (3, 6, 9)),
-        hide_drawn('2 knocked of 24', (5.0,), Setup(poses=24, knocked=2))),
-    'lag': tuple(hide_lag(f'{behind} lags, size {size:g}', sign, size)
+    'missing': (Group('column missing', lambda rng: [({name: 3.0}, Setup(dropped=lost))
+                                                     for name, lost in LOST.items()]),),
+    'knocked': (Group('three knocked in 60', lambda rng: [({}, Setup(knocked=3))] * 3),),
+    'small': (hide_each('too small to be seen',
+                        tuple(name for name in CATALOGUE if name not in ON_OUTPUT), 0.3),),
+    'faint': tuple(hide_each(ONE, CATALOGUE, size, Setup(poses=24)) for size in (1.5, 2.0)),
+    'few': (*(hide_each(ONE, CATALOGUE, size, Setup(poses=16)) for size in (3.0, 5.0)),
+            replace(hide_each(ONE, CATALOGUE, 8.0, Setup(poses=12)), base='auto')),
+    'three': (hide_drawn('three effects, 60 poses, size 3', (3.0,) * 3),
+              hide_drawn('three effects, 60 poses, size 5', (5.0,) * 3),
+              hide_drawn('three effects, 100 poses, size 3', (3.0,) * 3, Setup(poses=100))),
+    'knocked_and_one': tuple(
+        hide_drawn(f'one effect of size 5, {count} knocked of {poses}', (5.0,),
+                   Setup(poses=poses, knocked=count))
+        for count, poses in ((3, 60), (6, 60), (9, 60), (2, 24))),
+    'lag': tuple(hide_lag(f'{behind} lags by 30 to 300 s, size {size:g}', sign, size)
                  for behind, sign in (('the thermometer', 1.0), ('the sensing element', -1.0))
                  for size in (20.0, 5.0)),
-    'curved': (hide('', {'offset_temperature': 5.0, 'offset_temperature_quadratic': 5.0},
-                    Setup()),),
-    'chamber': (hide('', {'offset_temperature': 5.0, 'gain_temperature': 5.0, 'warm_up': 5.0},
+    'curved': (hide('offset linear and quadratic in temperature, size 5',
+                    {'offset_temperature': 5.0, 'offset_temperature_quadratic': 5.0}, Setup()),),
+    'chamber': (hide('offset and gain over temperature, and warm-up, size 5',
+                     {'offset_temperature': 5.0, 'gain_temperature': 5.0, 'warm_up': 5.0},
                      Setup()),),
-    'sign': (hide('', {'hysteresis': 3.0}, Setup(hysteresis='sign')),),
+    'sign': (hide('hysteresis by the sign of the motion, size 3', {'hysteresis': 3.0},
+                  Setup(hysteresis='sign')),),
     'spoiled': (
         hide('noise understated 2 times', {}, Setup(understated=2.0)),
         hide('noise understated 2 times, 24 poses', {}, Setup(poses=24, understated=2.0)),
@@ -153,20 +159,22 @@ GROUPS: dict[str, tuple[Group, ...]] = {
         hide('heavy tails, 24 poses', {}, Setup(poses=24, heavy=True)),
         hide('rows of one orientation in a row', {}, Setup(poses=24, repeats=3),
              Setup(poses=64, repeats=8), Setup(repeats=5), base='auto'),
-        *(hide(f'scatter of {size:g} times the noise, which differs 30 times, {poses} poses',
-               {'repeatability': size}, Setup(poses=poses, shaking=30.0))
-          for poses in (60, 24) for size in (1.5, 5.0))),
-    'flicker': tuple(hide(f'{poses} poses, size {size:g}', {'wander_1f': size},
-                          Setup(poses=poses)) for poses in (60, 200) for size in (3.0, 8.0)),
-    'large': (hide_drawn('60 poses, sizes 100 and 3', (100.0, 3.0), Setup(noise_mg=1.0), BIG),),
-    'outside60': (hide_each(OUTSIDE, 8.0),),
-    'outside200': tuple(hide_each(OUTSIDE, size, Setup(poses=200)) for size in (3.0, 8.0)),
+        *(hide(SCATTER.format(size, poses), {'repeatability': size},
+               Setup(poses=poses, shaking=30.0)) for poses in (60, 24) for size in (1.5, 5.0))),
+    'flicker': tuple(hide(f'1/f noise of the offset, {poses} poses, size {size:g}',
+                          {'wander_1f': size}, Setup(poses=poses))
+                     for poses in (60, 200) for size in (3.0, 8.0)),
+    'large': (hide_drawn('two effects, 60 poses, sizes 100 and 3', (100.0, 3.0),
+                         Setup(noise_mg=1.0), BIG),),
+    'outside60': (hide_each(OUT, OUTSIDE, 8.0),),
+    'outside200': tuple(hide_each(OUT, OUTSIDE, size, Setup(poses=200)) for size in (3.0, 8.0)),
     'columns': tuple(
-        replace(hide_each(('offset_temperature', 'gain_temperature'), 3.0), columns=count,
-                what=f'size 3, beside {count - 1} of noise') for count in (1, 10)),
+        replace(hide_each(f'an unknown column beside {count - 1} of noise',
+                          ('offset_temperature', 'gain_temperature'), 3.0), columns=count)
+        for count in (1, 10)),
     'noise_columns': (replace(hide('25 columns of noise', {}, Setup()), columns=25),),
-    'memory': (hide('hysteresis of two turns', {'hysteresis': 3.0}, Setup(hysteresis='memory')),
-               hide('creep', {'creep': 3.0}, Setup())),
+    'memory': (hide(f'{TURNS}, hysteresis of two turns', {'hysteresis': 3.0},
+                    Setup(hysteresis='memory')), hide(f'{TURNS}, creep', {'creep': 3.0}, Setup())),
 }
 """The groups of each row; the seeds depend on the order of the rows."""
 

@@ -12,8 +12,6 @@ from 2028 on. ``pip install scikit-learn pysindy`` installs what they need.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,7 +33,7 @@ from pysindy.optimizers import STLSQ
 from refine import BASE, run_case
 from refine_sets import Case, cases_of, PAIRED, true_form_error_mg
 import scipy
-from sensors import poses_of
+from sensors import simulated_poses
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, RBF, WhiteKernel
 from sklearn.linear_model import LassoCV
@@ -225,7 +223,7 @@ def judge_ways(case: Case) -> Judged:
     warnings.simplefilter('ignore')  # of sklearn and pysindy: no convergence, nothing chosen
     made = simulate(np.random.default_rng(case.seed), case.hidden, case.setup)
     other = again(np.random.default_rng((*case.seed, 1)), made)
-    each, outcome = library_of(poses_of(made), poses_of(other)), run_case(case)
+    each, outcome = library_of(simulated_poses(made), simulated_poses(other)), run_case(case)
     assert outcome.fresh, outcome.error
     found: dict[str, tuple[bool | None, float]] = {
         'refine': (outcome.judgement == 'exact', outcome.fresh[1] / outcome.fresh[0])}

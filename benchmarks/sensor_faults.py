@@ -9,8 +9,6 @@ fault must have no finding about the samples.
 
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -4,35 +4,35 @@
 """
 Random sensors, directions and poses of the benchmarks.
 
-The arithmetic of `Sensor`, its readings and derivatives is written out here; it shares no code
-with the models and the simulation of the package.
+The arithmetic of `Sensor` is written out here; it shares no code with the models and the
+simulation of the package.
 
 """
 
-from __future__ import annotations
+from dataclasses import dataclass
+from typing import NamedTuple
 
-from dataclasses import dataclass, replace
-
-from accel_calib.effects import Model, model_with
 from accel_calib.geometry import spread_directions, unit
 from accel_calib.statistics import rms
-from accel_calib.table import COLUMNS, concatenated, Floats, numbered, Poses
+from accel_calib.table import COLUMNS, Floats, Poses
 from accel_calib.units import MG
 from generator import Simulated
 import numpy as np
-from scipy.signal import lfilter
+from shared import poses_of
 
 NOISE = 3e-4
 """Standard deviation of a pose mean by axis [g]."""
 
+QUIET = 5.0
+"""Ratio of the scatter of poses to the noise that their samples show, where it is larger."""
+
+NOISES = {'measured': '', 'differs': ', noise that differs by pose (e-fold)',
+          'not given': ', noise not given', 'understated': ', a third of the noise stated',
+          'scatter': f', scatter of {QUIET:g} times the noise, which differs (e-fold)'}
+"""What the poses state of their noise, in words."""
+
 SAMPLES = 100
 JITTER = np.radians(8.0)
-FACES = np.vstack([np.eye(3), -np.eye(3)])
-
-
-def random_directions(count: int, rng: np.random.Generator) -> Floats:
-    """Return (count, 3) unit vectors, uniformly distributed over the sphere."""
-    return unit(rng.normal(size=(count, 3)))
 
 
 def tilt(directions: Floats, degrees: float, rng: np.random.Generator) -> Floats:
@@ -47,35 +47,12 @@ def spread(count: int, rng: np.random.Generator) -> Floats:
     return unit(spread_directions(count) @ turned + JITTER * rng.normal(size=(count, 3)))
 
 
-def draw_model(rng: np.random.Generator, offset: float = 0.03) -> Model:
-    """Draw a sensor with offset, gains and cross-axis gains, as a model of the package."""
-    sizes = {'offset': offset, 'axis_gain': 0.02, 'cross_axis': 0.01}
-    return model_with({name: rng.normal(size=3) * size for name, size in sizes.items()})
-
-
-def draw_noise(rng: np.random.Generator, count: int, rate_hz: float, correlation: float
-               ) -> Floats:
-    """Return (count, 3) noise of variance 1 with this correlation time [s]."""
-    keep = np.exp(-1.0 / (rate_hz * correlation)) if correlation > 0.0 else 0.0
-    start = int(10.0 * correlation * rate_hz)
-    white = rng.normal(size=(count + start, 3))
-    return np.asarray(lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], white, axis=0)[start:])
-
-
-def join(poses: Poses, more: Poses) -> Poses:
-    """Return poses followed by others."""
-    columns = concatenated([poses, more]).columns
-    return Poses(columns, numbered(columns))
-
-
-def poses_of(made: Simulated) -> Poses:
+def simulated_poses(made: Simulated) -> Poses:
     """Return poses of the independent simulator of the tests, as the reader of tables does."""
-    columns = {}
-    for key, column in COLUMNS.items():
-        parts = [made.columns[name] for name in column.names if name in made.columns]
-        if len(parts) == len(column.names):
-            columns[key] = np.column_stack(parts) if len(parts) > 1 else parts[0]
-    return Poses(columns, numbered(columns))
+    columns = {key: [made.columns[name] for name in column.names]
+               for key, column in COLUMNS.items() if {*column.names} <= {*made.columns}}
+    return poses_of(**{key: np.column_stack(parts) if len(parts) > 1 else parts[0]
+                       for key, parts in columns.items()})
 
 
 def length_error_mg(force: Floats) -> float:
@@ -114,28 +91,13 @@ class Sensor:
         return np.concatenate([self.offset, *parts.get(
             model, (diagonal, cross, skew[[2, 0, 1], [1, 2, 0]]))])
 
-    def length_slopes(self, force: Floats) -> Floats:
-        """
-        Return the (n, 9) derivative of |force| by the values of model 10, at true forces of 1 g.
 
-        With a = û W⁻¹ the derivative by V_i is -a_i, and that by W_ij is -a_i u_j.
-
-        """
-        a = force @ np.linalg.inv(self.gain)
-        cross = [a[:, i] * force[:, j] + a[:, j] * force[:, i]
-                 for i, j in ((0, 1), (0, 2), (1, 2))]
-        return -np.column_stack([a, a * force, *cross])
-
-
-@dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """A sensor and its n poses."""
 
     sensor: Sensor
     poses: Poses  # in g
     force: Floats  # (n, 3) true specific force of each pose [g]
-    noise: Floats  # (n,) true standard deviation of each pose, by axis, with its scatter [g]
-    shows_mg: Floats  # (n,) change of |force| by a knock; 0 if the pose was not knocked
 
 
 def draw_sensor(rng: np.random.Generator, kind: str = '10') -> Sensor:
@@ -151,54 +113,20 @@ def draw_sensor(rng: np.random.Generator, kind: str = '10') -> Sensor:
     return Sensor(gain, 0.03 * rng.normal(size=3))
 
 
-def draw_case(rng: np.random.Generator, count: int, kind: str = '10', *,
-              noise: Floats | float = NOISE, scatter: float = 0.0, stated: float = 1.0,
-              force: Floats | None = None) -> Case:
-    """
-    Draw a sensor and its poses.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of all random numbers.
-    count : int
-        Number of poses.
-    kind : {'4', '7', '10', '12'}
-        Number of parameters of the sensor.
-    noise : float or (count,) array
-        Standard deviation of a pose mean, by axis [g].
-    scatter : float
-        Standard deviation of a pose beyond this noise, which its samples do not show [g].
-    stated : float
-        Ratio of the noise that the poses state to their real noise.
-    force : (count, 3) array, optional
-        Directions; by default they are spread over the sphere.
-
-    """
-    sensor = draw_sensor(rng, kind)
-    force = spread(count, rng) if force is None else force
-    each = np.broadcast_to(np.asarray(noise, float), (count,))[:, np.newaxis]
-    true = np.hypot(each, scatter)
+def draw_case(rng: np.random.Generator, count: int, kind: str = '10', noise: str = 'measured'
+              ) -> Case:
+    """Draw a sensor, as `draw_sensor`, and poses spread over the sphere with one of `NOISES`."""
+    each = np.full((count, 1), NOISE)
+    if noise in ('differs', 'scatter'):
+        each *= np.exp(rng.normal(size=(count, 1)))
+    if noise == 'scatter':
+        each /= QUIET
+    sensor, force = draw_sensor(rng, kind), spread(count, rng)
     measured = np.sqrt(rng.chisquare(SAMPLES - 1, size=(count, 3)) / (SAMPLES - 1))
-    columns = {'reading': sensor.reading(force) + true * rng.normal(size=(count, 3)),
-               'std': stated * each * np.sqrt(SAMPLES) * measured,
-               'count': np.full(count, float(SAMPLES))}
-    return Case(sensor, Poses(columns, numbered(columns)), force, true[:, 0], np.zeros(count))
-
-
-def knock(case: Case, rng: np.random.Generator, count: int, size: float = 0.05) -> Case:
-    """Return the case with some poses knocked in random directions, by `size` [g]."""
-    rows = rng.choice(len(case.poses), count, replace=False)
-    reading = case.poses.reading.copy()
-    reading[rows] += size * random_directions(count, rng)
-    shows = np.abs(case.sensor.lengths(reading) - case.sensor.lengths(case.poses.reading)) * MG
-    return replace(case, poses=case.poses.with_columns(reading=reading), shows_mg=shows)
-
-
-def misplace(rng: np.random.Generator, count: int, degrees: float) -> Case:
-    """Draw poses of known orientation, six faces and others, each misplaced by an angle."""
-    stated = np.vstack([FACES, spread(count - 6, rng)])
-    across = unit(np.cross(stated, random_directions(count, rng)))
-    angle = np.radians(degrees)
-    case = draw_case(rng, count, '12', force=np.cos(angle) * stated + np.sin(angle) * across)
-    return replace(case, poses=case.poses.with_columns(reference=stated))
+    scatter = np.hypot(each, NOISE if noise == 'scatter' else 0.0) * rng.normal(size=(count, 3))
+    stated = each / 3.0 if noise == 'understated' else each
+    poses = poses_of(sensor.reading(force) + scatter, std=stated * np.sqrt(SAMPLES) * measured,
+                     count=np.full(count, SAMPLES))
+    if noise == 'not given':
+        poses = poses.without_columns('std', 'count')
+    return Case(sensor, poses, force)

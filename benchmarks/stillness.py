@@ -15,10 +15,8 @@ stated noise; its standard deviation is 1 if the statement is right.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 import itertools
 from typing import Any, Literal, NamedTuple
 
@@ -29,12 +27,11 @@ from accel_calib.logs import read_recording
 from accel_calib.stillness import CaptureSettings, StillDetector
 from accel_calib.table import Floats, numbered, Poses
 from accel_calib.units import units_of
-from figures import DATA, Frame, Line, markdown, table
+from figures import check, DATA, Frame, Line, markdown, share, table
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation
-from sensors import draw_noise
 
 KINDS = {'plain': 'turned by hand', 'tremor': 'also held in the hand, tremor of 1 to 10 mg',
          'turning': 'also turned at 0.5 to 5 °/s', 'footsteps': 'steps of 2 to 20 mg beside it',
@@ -138,6 +135,15 @@ def draw_shaking(rng: np.random.Generator, kind: str, size: float, phase: NDArra
     return carried + (draw_steps(rng, count, rate_hz, size) if kind == 'footsteps' else 0.0)
 
 
+def draw_noise(rng: np.random.Generator, count: int, rate_hz: float, correlation: float
+               ) -> Floats:
+    """Return (count, 3) noise of variance 1 with this correlation time [s]."""
+    keep = np.exp(-1.0 / (rate_hz * correlation)) if correlation > 0.0 else 0.0
+    start = int(10.0 * correlation * rate_hz)
+    white = rng.normal(size=(count + start, 3))
+    return np.asarray(lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], white, axis=0)[start:])
+
+
 def draw_swing(rng: np.random.Generator, count: int, rate_hz: float, size: float,
                frequency: float, jitter: float) -> Floats:
     """Return an oscillation in a fixed direction; its frequency [Hz] wanders by `jitter`."""
@@ -229,27 +235,33 @@ RULES: dict[str, Callable[[Case], list[Pose]]] = {
 
 # ------------------------------------------------------------------------------- poses and truth
 
-class Score(NamedTuple):
-    """The poses of a rule in one recording, beside the truth."""
+@dataclass
+class Score:
+    """The poses of a rule in some recordings, beside the truth."""
 
-    moving: int  # samples while moving,
-    taken: int  # and those of them in poses
-    resting: int  # samples at rest,
-    used: int  # and those of them in poses
-    rests: int
-    missed: int  # rests without a pose
-    false: list[Floats]  # (3,) normalised errors of false poses
-    errors: list[Floats]  # (3,) errors of pose means [g]
-    norms: list[float]  # errors of their norms [g]
-    normalised: list[Floats]  # (3,) normalised errors
+    moving: int = 0  # samples while moving,
+    taken: int = 0  # and those of them in poses
+    resting: int = 0  # samples at rest,
+    used: int = 0  # and those of them in poses
+    rests: int = 0
+    missed: int = 0  # rests without a pose
+    false: list[Floats] = field(default_factory=list)  # (3,) normalised errors of false poses
+    errors: list[Floats] = field(default_factory=list)  # (3,) errors of pose means [mg]
+    norms: list[float] = field(default_factory=list)  # errors of their norms [mg]
+    normalised: list[Floats] = field(default_factory=list)  # (3,) normalised errors
+
+    def __add__(self, other: 'Score') -> 'Score':
+        return Score(*(getattr(self, each.name) + getattr(other, each.name)
+                       for each in fields(self)))
 
 
 def score_rules(kind: str, seed: int, noisy: bool, number: int) -> list[Score]:
     """Draw a recording and compare the poses of each rule with the truth."""
     case, scores = draw_case(kind, seed, noisy, number), []
     for rule in RULES.values():
+        found = Score(moving=int(case.moving.sum()), resting=int((~case.moving).sum()),
+                      rests=len(case.rests))
         inside = np.zeros(len(case.time), dtype=bool)
-        errors, norms, normalised, false = [], [], [], []
         hit: set[int] = set()
         for pose in rule(case):
             first, last = np.searchsorted(case.time, [pose.start - 1e-9, pose.end + 1e-9])
@@ -257,92 +269,73 @@ def score_rules(kind: str, seed: int, noisy: bool, number: int) -> list[Score]:
             common = np.minimum(case.rests[:, 1], last) - np.maximum(case.rests[:, 0], first)
             best = int(np.argmax(common))
             if common[best] <= 0.5 * (last - first):
-                false.append((pose.mean - case.force[(first + last) // 2]) / pose.noise)
+                found.false.append((pose.mean - case.force[(first + last) // 2]) / pose.noise)
                 continue
             hit.add(best)
-            errors.append(pose.mean - case.force[case.rests[best, 0]])
-            norms.append(float(np.linalg.norm(pose.mean)) - 1.0)
-            normalised.append(errors[-1] / pose.noise)
-        still = ~case.moving
-        scores.append(Score(
-            int(case.moving.sum()), int((inside & case.moving).sum()), int(still.sum()),
-            int((inside & still).sum()), len(case.rests), len(case.rests) - len(hit), false,
-            errors, norms, normalised))
+            error = pose.mean - case.force[case.rests[best, 0]]
+            found.errors.append(1e3 * error)
+            found.norms.append(1e3 * (float(np.linalg.norm(pose.mean)) - 1.0))
+            found.normalised.append(error / pose.noise)
+        found.taken, found.used = int((inside & case.moving).sum()), int(
+            (inside & ~case.moving).sum())
+        found.missed = found.rests - len(hit)
+        scores.append(found)
     return scores
 
 
-class Sum(NamedTuple):
-    """Scores of many recordings: shares, false poses, errors [mg], normalised errors."""
-
-    taken: float
-    used: float
-    missed: float
-    false: int
-    error: float
-    worst: float
-    norm: float
-    normalised: float
-    of_false: float
-
-
-def sum_scores(scores: Sequence[Score]) -> Sum:
-    """Return the sum of the scores of many recordings."""
-    def total(name: str) -> int:
-        return sum(getattr(each, name) for each in scores)
-
-    def values(name: str) -> Floats:
-        return np.array([value for each in scores for value in getattr(each, name)])
-
-    errors = 1e3 * np.abs(values('errors'))
-    return Sum(total('taken') / max(total('moving'), 1), total('used') / total('resting'),
-               total('missed') / total('rests'), sum(len(each.false) for each in scores),
-               float(np.median(errors)) if len(errors) else np.nan,
-               float(np.max(errors, initial=0.0)), 1e3 * rms_of_smallest(values('norms'), 1.0),
-               rms_of_smallest(values('normalised'), 0.99), rms_of_smallest(values('false'), 0.99))
-
-
-def rms_of_smallest(values: Floats, share: float) -> float:
+def rms_of_smallest(values: Sequence[Any], share: float) -> float:
     """Return the root mean square of the smallest values, as many as this share."""
     squares = np.sort(np.square(values), axis=None)
     kept = squares[:int(np.ceil(share * len(squares)))]
     return float(np.sqrt(np.mean(kept))) if len(kept) else np.nan
 
 
-Sums = dict[tuple[str, str], Sum]
+Scores = dict[tuple[str, str], Score]
 """By kind and rule."""
 
 
-def measure(frame: Frame, sets: int, seed: int, noisy: bool) -> Sums:
-    """Return the sums of all rules on recordings of all kinds."""
-    found: Sums = {}
+def measure(frame: Frame, sets: int, seed: int, noisy: bool) -> Scores:
+    """Return the scores of all rules on recordings of all kinds."""
+    found: Scores = {}
     for kind in KINDS:
         scores = frame.run_sets(score_rules, sets, kind, seed, noisy)
         for rule, each in zip(RULES, zip(*scores)):
-            found[kind, rule] = sum_scores(each)
+            found[kind, rule] = sum(each, Score())
     return found
 
 
-def compare_rules(found: Sums) -> str:
+def row_of(score: Score) -> Iterator[str]:
+    """Yield the figures of a rule in words."""
+    yield f'{score.taken / max(score.moving, 1):.2%}'
+    yield f'{score.used / score.resting:.1%}'
+    yield f'{score.missed / score.rests:.1%}'
+    yield str(len(score.false))
+    errors = np.abs(score.errors)
+    yield f'{np.median(errors):.3f}' if len(errors) else ''
+    yield f'{np.max(errors, initial=0.0):.1f}'
+    yield f'{rms_of_smallest(score.norms, 1.0):.3f}'
+    yield f'{rms_of_smallest(score.normalised, 0.99):.2f}'
+    yield f'{rms_of_smallest(score.false, 0.99):.2f}' if score.false else ''
+
+
+def compare_rules(found: Scores) -> str:
     heads = ('recordings', 'rule', 'moving samples in poses', 'rest used', 'rests missed',
              'false poses', 'median error of a mean, mg', 'largest, mg',
              'RMS error of its norm, mg', 'normalised error', 'the same of false poses')
-    return markdown(heads, (
-        (KINDS[kind], rule, f'{x.taken:.2%}', f'{x.used:.1%}', f'{x.missed:.1%}', x.false,
-         f'{x.error:.3f}', f'{x.worst:.1f}', f'{x.norm:.3f}', f'{x.normalised:.2f}',
-         f'{x.of_false:.2f}' if np.isfinite(x.of_false) else '')
-        for (kind, rule), x in found.items()))
+    return markdown(heads, ((KINDS[kind], rule, *row_of(score))
+                            for (kind, rule), score in found.items()))
 
 
-def lines_of(found: Sums, noise: str, sets: int) -> Iterator[Line]:
+def lines_of(found: Scores, noise: str, sets: int) -> Iterator[Line]:
     """Yield what is asked of the detector beside what is measured."""
     for rule in ('ours', 'ours, gyro'):
-        false = found['turning', rule].false
-        yield Line(f'{noise}, {rule}: poses taken while turning slowly', str(false), sets, '0',
-                   false == 0)
+        false = len(found['turning', rule].false)
+        yield check(f'{noise}, {rule}: poses taken while turning slowly', str(false), false,
+                    most=0, least=0, sets=sets)
         for kind, words in KINDS.items():
-            x = found[kind, rule].normalised
-            yield Line(f'{noise}, {rule}, {words}: normalised error of pose means', f'{x:.2f}',
-                       sets, '0.85 to 1.15', 0.85 <= x <= 1.15)
+            x = rms_of_smallest(found[kind, rule].normalised, 0.99)
+            yield check(f'{noise}, {rule}, {words}: normalised error of pose means', f'{x:.2f}', x,
+                        least=0.85, most=1.15, sets=sets)
 
 
 # --------------------------------------------------------------- disturbed from the first second
@@ -354,16 +347,17 @@ class Disturbance(NamedTuple):
     kind: str  # swing, an oscillation; or noise that is white or has passed a low-pass: filtered
     band: tuple[float, float]  # frequencies [Hz]
     size: tuple[float, float]  # amplitudes or standard deviations [g]
-    least: float | None  # asked: the share that counts as rest; 0: none; None: nothing is asked
+    least: float = -np.inf  # asked: the share of recordings that is captured [%]
+    most: float = np.inf
 
 
 FIRST = (
-    Disturbance('shaking at 1 to 5 Hz, 20 to 200 mg', 'swing', (1.0, 5.0), (0.02, 0.2), 0.0),
-    Disturbance('tremor at 8 to 12 Hz, 5 to 50 mg', 'swing', (8.0, 12.0), (5e-3, 0.05), None),
-    Disturbance('vibration at 30 to 80 Hz, 20 mg', 'swing', (30.0, 80.0), (0.02, 0.02), 0.95),
-    Disturbance('white noise of 20 to 50 mg', 'white', (0.0, 0.0), (0.02, 0.05), 0.95),
+    Disturbance('shaking at 1 to 5 Hz, 20 to 200 mg', 'swing', (1.0, 5.0), (0.02, 0.2), most=0.0),
+    Disturbance('tremor at 8 to 12 Hz, 5 to 50 mg', 'swing', (8.0, 12.0), (5e-3, 0.05)),
+    Disturbance('vibration at 30 to 80 Hz, 20 mg', 'swing', (30.0, 80.0), (0.02, 0.02), 95.0),
+    Disturbance('white noise of 20 to 50 mg', 'white', (0.0, 0.0), (0.02, 0.05), 95.0),
     Disturbance('noise of 5 to 20 mg, low-pass at 5 to 40 Hz', 'filtered', (5.0, 40.0),
-                (5e-3, 0.02), 0.95))
+                (5e-3, 0.02), 95.0))
 
 
 def is_captured(index: int, seed: int, number: int) -> bool:
@@ -389,12 +383,9 @@ def is_captured(index: int, seed: int, number: int) -> bool:
 
 def lines_of_first(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
     """Yield how often a sensor that never rested before is captured, for each disturbance."""
-    for index, each in enumerate(FIRST):
-        share = np.mean(frame.run_sets(is_captured, sets, index, seed))
-        asked = {0.95: '≥ 95 %', 0.0: '0 %', None: ''}[each.least]
-        met = None if each.least is None else bool(
-            share >= each.least if each.least else share == 0.0)
-        yield Line(f'{each.what}: captured', f'{share:.0%}', sets, asked, met)
+    for index, (what, *_, least, most) in enumerate(FIRST):
+        yield share(f'{what}: captured', frame.run_sets(is_captured, sets, index, seed),
+                    least=least, most=most)
 
 
 # -------------------------------------------------------------------------------- real recordings
