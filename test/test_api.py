@@ -79,19 +79,6 @@ def test_a_calibration_is_stored_read_and_used_again(calibration, poses, tmp_pat
     assert '<svg' in (tmp_path / 'page.html').read_text(encoding='utf-8')
 
 
-def test_a_recording_is_captured_from_a_file_and_from_memory(recording, tmp_path):
-    pytest.importorskip('pandas')
-    path = tmp_path / 'recording.csv'
-    write_table(path, recording)
-    expected = ac.capture(recording)
-    assert len(expected) == 6
-    for given in (str(path), ac.read_recording(path)):
-        np.testing.assert_allclose(ac.capture(given).reading, expected.reading, atol=1e-6)
-    assert len(ac.capture(recording, min_dwell=2.0)) == 6
-    with pytest.raises(InputError, match='has no still stretch'):
-        ac.capture(recording, min_dwell=60.0, max_dwell=600.0)
-
-
 @pytest.mark.parametrize('name', ['esp32/micros.csv', 'phyphox/semicolon_point.csv',
                                   'sensor-logger/android/TotalAcceleration.csv'])
 def test_a_data_frame_of_samples_is_read_as_the_file_is(name):

@@ -9,7 +9,6 @@ Few poses are fitted with the typical values.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 import re
 from typing import Any
@@ -22,7 +21,6 @@ from accel_calib.errors import InputError
 from accel_calib.estimate import Prior
 from accel_calib.findings import rate_fleet
 from accel_calib.fleet import Store
-from accel_calib.logs import write_table
 from accel_calib.stored import read_calibration, read_prior, write_calibration, write_priors
 from accel_calib.table import Floats, Poses
 from fleet_case import page_of
@@ -33,7 +31,7 @@ from inside import (
     write_parquet)
 import numpy as np
 import pytest
-from shared import error_mg, G, refused, rms, run_json, table
+from shared import error_mg, G, rms, table
 
 NAMES = ('offset.x', 'offset.y', 'offset.z', 'gain.x', 'gain.y', 'gain.z', 'gain.xy', 'gain.xz',
          'gain.yz')
@@ -343,37 +341,3 @@ def test_a_damaged_file_is_refused(
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(InputError, match=words):
         read_prior(path)
-
-
-def bent(sensor: Model) -> Model:
-    """Return a sensor with a nonlinearity beyond model 10."""
-    return Model({**sensor.values, 'quadratic': np.array([0.012, -0.010, 0.011])})
-
-
-@pytest.mark.usefixtures('without_pages')
-def test_a_refinement_with_the_file_of_the_fleet_finds_an_effect_beyond_it(
-        fleet: FleetPrior, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rng = np.random.default_rng(11)
-    write_priors(tmp_path / 'fleet.yaml', {name: replace(fleet, model=name) for name in 'AB'})
-    for count, effects in ((6, []), (16, ['quadratic'])):
-        table, out = tmp_path / f'{count}.csv', tmp_path / f'{count}.yaml'
-        sensor = bent(a_sensor(rng))
-        poses = poses_of(sensor, count, rng)
-        write_table(table, poses)
-        given = table, '--units', 'g', '--prior', tmp_path / 'fleet.yaml'
-        of_b = *given, '--sensor-model', 'B'
-        refused(capsys, 'refine', *given)
-        status, found = run_json(capsys, 'refine', *of_b, '-o', out)
-        assert (status, [step['effect'] for step in found['steps']]) == (0, effects)
-        refused(capsys, 'fit', *of_b, '--model', '4')
-        stored = read_calibration(out)
-        assert stored.method == 'fleet'
-        assert stored.reason.endswith(' of model B')
-        if effects:
-            plain = error_mg(fit_poses(poses, G, model='10'), sensor)
-            assert error_mg(stored, sensor) < 0.2 * plain
-            deviation = np.sqrt(np.diag(stored.covariance))
-            assert rms((stored.model.vector - sensor.vector) / deviation) < 2.0
-        found = run_json(capsys, 'calibrate', *of_b, '-o', out, '--keep-bad')[1]
-        assert read_calibration(out).method == 'fleet'
-        assert ('quadratic' in found['refined']) is bool(effects)

@@ -14,7 +14,7 @@ from pathlib import Path
 import tracemalloc
 import zipfile
 
-from accel_calib.calibration import fit_poses, level_by_rows
+from accel_calib.calibration import fit_poses
 from accel_calib.errors import InputError
 from accel_calib.fleet import recordings
 from accel_calib.logs import FORMATS, LogOptions, open_log, read_poses, SUFFIXES
@@ -250,12 +250,6 @@ def test_a_wrong_number_is_named_by_its_row_and_no_temperature_is_beyond_a_senso
             read_log(write(tmp_path, ''.join(['time,ax,ay,az,temperature\n', *lines])))
 
 
-def test_an_orientation_is_a_whole_number(tmp_path):
-    rows = rows_of(G * spread_directions(12), np.linspace(0.0, 330.5, 12))
-    with pytest.raises(InputError, match='orientation holds fractions'):
-        read_poses(write(tmp_path, text_of(rows, 'ax,ay,az,orientation')))
-
-
 # Samples of the makers' layouts
 
 
@@ -282,13 +276,3 @@ def test_the_truth_of_a_sample_is_found_without_options_and_with_its_format(name
     assert named.units == log.units
     np.testing.assert_allclose(named.table.reading, log.table.reading, rtol=1e-12)
     np.testing.assert_allclose(named.table['time'], log.table['time'], rtol=1e-12)
-
-
-def test_a_flat_pose_makes_a_level_vehicle_read_up() -> None:
-    log = read_log(LOGS / 'px4/log_sensor_accel_0.csv')
-    poses = capture(log.table, log.units).poses  # type: ignore[arg-type]
-    fitted = fit_poses(poses, log.units, model='10')
-    calibration = level_by_rows(fitted, poses, 'ros', 1, None)
-    up = calibration.apply(poses.reading[:1])[0] / log.units.per_g
-    np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=2e-3)
-    np.testing.assert_allclose(calibration.rotation, make.FRD, atol=2e-2)

@@ -27,7 +27,6 @@ from bag_files import swapped
 from inside import Model, rotation_from_rpy
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from shared import known, random_directions, table, values_of, with_effects
 
 COUNT = int(os.environ.get('IMU_MESSAGES', '800'))
@@ -85,26 +84,6 @@ def fields_of(count=6):
         root = fields[:, part].reshape(-1, 3, 3) * 0.01
         fields[:, part] = (root @ np.swapaxes(root, 1, 2)).reshape(-1, 9)
     return fields
-
-
-def test_with_a_mounting_all_fields_are_in_one_frame(levelled):
-    fields, rotation = fields_of(), levelled.model.rotation
-    found = corrected(levelled, fields)
-    np.testing.assert_allclose(found[:, ANGULAR_VELOCITY], fields[:, ANGULAR_VELOCITY] @ rotation)
-    for part in (ANGULAR_VELOCITY_COVARIANCE, ORIENTATION_COVARIANCE):
-        turned, given = found[:, part].reshape(-1, 3, 3), fields[:, part].reshape(-1, 3, 3)
-        np.testing.assert_allclose(rotation @ turned @ rotation.T, given, atol=1e-15)
-    before = Rotation.from_quat(fields[:, ORIENTATION])
-    after = Rotation.from_quat(found[:, ORIENTATION])
-    np.testing.assert_allclose(after.apply(found[:, ANGULAR_VELOCITY]),
-                               before.apply(fields[:, ANGULAR_VELOCITY]))
-    # A known covariance is transformed, and grows by that of the calibration.
-    inverse = levelled.model.rotation.T @ np.linalg.inv(levelled.gain)
-    own = inverse @ fields[:, ACCELERATION_COVARIANCE].reshape(-1, 3, 3) @ inverse.T
-    added = found[:, ACCELERATION_COVARIANCE].reshape(-1, 3, 3) - own
-    np.testing.assert_allclose(added, levelled.force_covariance(found[:, ACCELERATION]),
-                               atol=1e-15)
-    assert np.all(np.linalg.eigvalsh(added) > 0)
 
 
 @pytest.mark.parametrize('turned', [False, True])

@@ -269,16 +269,6 @@ def figures(driver: Driver) -> dict[str, Any]:
     return json.loads(driver.results[-1])
 
 
-def test_a_healthy_sensor_is_done_after_poses_fit_and_level() -> None:
-    driver, person = followed()
-    assert list(dict.fromkeys(person.steps)) == ['poses', 'fit', 'level', 'done']
-    assert driver.sensor.rating.name == 'GOOD'
-    np.testing.assert_allclose(driver.calibration.offset / GRAVITY, OFFSET, atol=1e-3)
-    assert driver.finding('calibration').level == 'GOOD'
-    enable(driver.session, False)
-    assert driver.finding('calibration').level == 'USABLE'
-
-
 def test_an_effect_of_temperature_leads_to_refine_and_is_kept_by_a_fit() -> None:
     driver, person = followed(warming, warms=1.2)
     assert 'refine' in person.steps
@@ -373,13 +363,6 @@ def test_an_effect_far_beyond_those_of_parts_is_reported_and_not_used() -> None:
         driver.ask('refine')
     assert '/board/temperature or /cpu' in refused.value.advice
     assert driver.calibration is before
-
-
-def test_the_heading_by_a_raised_nose_is_questioned() -> None:
-    driver, person = followed()
-    for questioned in (True, False):
-        person.rest([0.5, 0.0, 0.8], 4.0)
-        assert ('nose was up' in driver.ask('set_heading')) is questioned
 
 
 def test_an_effect_of_time_does_not_warn_for_ever() -> None:

@@ -7,7 +7,6 @@ import math
 import re
 from typing import Any
 
-from accel_calib.errors import InputError
 from accel_calib.geometry import StaticTransforms
 from builtin_interfaces.msg import Time
 from inside import quaternion_of, rotation_from_rpy
@@ -47,53 +46,6 @@ def robot() -> StaticTransforms:
 ])
 def test_rotations_are_multiplied_along_the_path(base: str, frame: str, expected: Any) -> None:
     np.testing.assert_allclose(robot().rotation(base, frame), expected, atol=1e-12)
-
-
-def test_rotation_transforms_vectors_from_frame_to_base_with_or_without_a_slash() -> None:
-    tree = StaticTransforms()
-    tree.add('/base', '/imu', (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)))  # turned left by 90°
-    for base, frame, y in (('base', 'imu', 1), ('/base', 'imu', 1), ('imu', '/base', -1)):
-        np.testing.assert_allclose(tree.rotation(base, frame) @ [1, 0, 0], [0, y, 0], atol=1e-12)
-
-
-def test_frames_without_a_connection_have_no_rotation() -> None:
-    tree = robot()
-    tree.add('map', 'dock', UNIT)
-    assert tree.rotation('base', 'dock') is None
-    assert tree.rotation('base', 'unknown') is None
-    assert tree.rotation('unknown', 'imu') is None
-
-
-def test_new_transform_replaces_the_previous_one_of_its_child() -> None:
-    tree = robot()
-    assert not tree.add('mast', 'imu', quaternion_of(IMU))
-    assert tree.add('mast', 'imu', quaternion_of(LIDAR))
-    np.testing.assert_allclose(tree.rotation('base', 'imu'), MAST @ LIDAR, atol=1e-12)
-    assert tree.add('lidar', 'imu', quaternion_of(LIDAR))
-    np.testing.assert_allclose(tree.rotation('base', 'imu'), LIDAR @ LIDAR, atol=1e-12)
-
-
-def test_rounded_quaternions_give_proper_rotations() -> None:
-    tree = StaticTransforms()
-    tree.add('base', 'imu', [round(part, 3) for part in quaternion_of(IMU)])
-    found = tree.rotation('base', 'imu')
-    assert found is not None
-    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(found, IMU, atol=2e-3)
-
-
-@pytest.mark.parametrize(('parent', 'child', 'quaternion', 'words'), [
-    ('mast', 'imu', (0.0, 0.0, 0.0, 0.0), 'length 0'),
-    ('mast', 'imu', (0.0, math.nan, 0.0, 1.0), 'length nan'),
-    ('mast', 'imu', (0.0, 0.0, math.inf, 1.0), 'length inf'),
-    ('mast', 'imu', (1.0, 1.0, 1.0, 1.0), 'length 2'), ('', 'imu', UNIT, 'empty'),
-    ('mast', '/', UNIT, 'empty'), ('imu', 'base', UNIT, 'loop'), ('imu', 'imu', UNIT, 'loop')])
-def test_invalid_transforms_are_refused_and_change_nothing(
-        parent: str, child: str, quaternion: tuple[float, ...], words: str) -> None:
-    tree = robot()
-    with pytest.raises(InputError, match=words):
-        tree.add(parent, child, quaternion)
-    np.testing.assert_allclose(tree.rotation('footprint', 'imu'), BASE @ MAST @ IMU, atol=1e-12)
 
 
 @pytest.mark.parametrize(('parameter', 'value', 'instead'), [

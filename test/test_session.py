@@ -440,20 +440,3 @@ def test_a_start_without_a_column_leaves_it_in_the_stored_poses(
             with open_log(driver.session.state.files.store.poses) as log:  # as a command reads it
                 assert column not in log.poses
                 assert [column in note for note in log.notes] == [True]
-
-
-def test_without_a_thermometer_the_middle_of_the_range_corrects_and_is_said(
-        stored: Stored, readings: Readings) -> None:
-    path = stored(sensor='imu_link')
-    calibration = with_effects(
-        read_calibration(path), {'offset_temperature': [0.01, -0.015, 0.02]}, 1e-14,
-        temperature=np.linspace(20.0, 40.0, 20))
-    write_calibration(path, calibration)
-    driver, reading = Driver(calibration_file=str(path)), readings([[0.0, 0.6, 0.8]])
-    driver.feed(reading)
-    driver.tick(31.0)
-    found = np.array(driver.sensor.force_of(tuple(reading[0]), driver.session.state.context))
-    expected = calibration.apply(reading[:1], temperature=[30.0])[0]
-    np.testing.assert_allclose(found * GRAVITY, expected, atol=1e-6)
-    assert 'no temperature arrives' in driver.finding('stream').words
-    assert driver.finding('stream').level == 'USABLE'

@@ -49,17 +49,6 @@ def by_hand(residual, columns, names, worth=WORTH, choice=0.0, tried=1.0, size=1
                   np.zeros((count, 3)), choice)
 
 
-def test_poses_left_out_beside_a_walk_span_orthonormal_columns():
-    state, linear = problem_of(poses_of({'quadratic': [2e-3, -1e-3, 1e-3]}), 'quadratic', 'cubic')
-    whitened = Walk(process_of(linear, state.poses_g), 3.0, 0.0, 0.0).whitened(linear)
-    chosen = Set.of(whitened, (0,), (3, 7))
-    onto, residual = chosen.spanned
-    assert onto.T @ onto == pytest.approx(np.eye(5), abs=1e-9)
-    assert onto.T @ whitened.whitened(whitened.columns) == pytest.approx(
-        chosen.across[:, :-1], abs=1e-9)
-    assert residual @ residual == pytest.approx(chosen.rss)
-
-
 def test_a_column_whose_squares_underflow_is_a_column_of_zeros():
     columns, sizes = outside_of(np.zeros((3, 0)), np.outer([1.0, 2.0, 3.0], [1.0, 1e-200]))
     assert (sizes[1], *columns[:, 1]) == (1.0, 0.0, 0.0, 0.0)
@@ -280,18 +269,6 @@ def test_whitened_equations_are_those_of_generalised_least_squares():
     flat = replace(walk, ratio=0.0).whitened(linear)
     np.testing.assert_array_equal(Set.of(flat).spanned[1], residual)
     assert white.penalty - flat.penalty == pytest.approx(np.linalg.slogdet(variance)[1])
-
-
-def test_a_pose_left_out_beside_a_walk_is_as_if_it_were_not_there():
-    rng, others = np.random.default_rng(5), np.delete(np.arange(30), 7)
-    walk, variance = random_walk(30, 6, 50.0, rng)
-    residual = rng.normal(size=30)
-    inverse = np.linalg.inv(variance[np.ix_(others, others)])
-    expected = residual[others] @ inverse @ residual[others]
-    for knock in (0.0, 30.0):
-        residual[7] += knock
-        white = walk.whitened(by_hand(residual, np.eye(30)[:, :1], ['supply_ratio']))
-        assert Set.of(white, (), (7,)).rss == pytest.approx(expected)
 
 
 @pytest.mark.parametrize('chosen', [(), (0,)])

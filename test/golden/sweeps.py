@@ -17,7 +17,7 @@ from accel_calib.effects import CHANGES, effect_named, EFFECTS, entry_of, MONOMI
 from accel_calib.estimate import estimate, Prior, variance_factor
 from accel_calib.finding import Finding, LEVELS
 from accel_calib.findings import Expected, LIMITS, rate
-from accel_calib.geometry import coverage
+from accel_calib.geometry import coverage, StaticTransforms
 from accel_calib.table import check_units
 from accel_calib.units import FRAMES, units_of
 from golden.driven import messages
@@ -180,6 +180,26 @@ def mountings() -> Any:
 
     return [_grid(flat, FRAMES, range(len(ups))), mounting_figures(turn, 'imu', 'base'),
             _grid(near, (4.0, 9.0, 11.0, 60.0, 169.0, 171.0))]
+
+
+def transforms() -> Any:
+    """Return rotations between frames, after each of some static transforms."""
+    tree = StaticTransforms()
+
+    def add(parent: str, child: str, *quaternion: float) -> Any:
+        changed = attempt(tree.add, parent, child, quaternion)
+        return [changed, [tree.rotation(*each) for each in (
+            ('base', 'imu'), ('/imu', '/lidar'), ('lidar', 'map'), ('imu', 'imu'))]]
+
+    half, nan, inf = np.sqrt(0.5), np.nan, np.inf
+    return [add(*each) for each in (
+        ('mast', 'imu', 0.1, -0.2, 0.3, 0.927), ('/base', 'lidar', 0.0, 0.0, half, half),
+        ('base', '/mast', half, 0.0, 0.0, half), ('map', 'dock', 0.0, 0.0, 0.0, 1.0),
+        ('base', 'mast', half, 0.0, 0.0, half), ('base', 'mast', 0.0, half, 0.0, half),
+        ('lidar', 'imu', 0.5, 0.5, 0.5, 0.5), ('', 'imu', 0.0, 0.0, 0.0, 1.0),
+        ('mast', '/', 0.0, 0.0, 0.0, 1.0), ('imu', 'base', 0.0, 0.0, 0.0, 1.0),
+        ('imu', 'imu', 0.0, 0.0, 0.0, 1.0), *(('mast', 'imu', *each) for each in (
+            (0.0, 0.0, 0.0, 0.0), (0.0, nan, 0.0, 1.0), (0.0, 0.0, inf, 1.0), (1.0,) * 4)))]
 
 
 def catalogue() -> Any:
@@ -434,5 +454,5 @@ def near_models() -> Any:
 
 SWEEPS: dict[str, Callable[[], Any]] = {
     each.__name__: each for each in (
-        directions, plans, noise, wiring, mountings, catalogue, gyro, changes, gates,
+        directions, plans, noise, wiring, mountings, transforms, catalogue, gyro, changes, gates,
         rated_effects, comparisons, priors, near_models, messages, screens)}
