@@ -3,8 +3,10 @@
 
 """Exports: each file, read as its maker reads it, corrects as the calibration does."""
 
+from contextlib import suppress
 from dataclasses import replace
 import io
+from itertools import product
 import json
 import re
 import shutil
@@ -262,6 +264,24 @@ def test_betaflight_gets_its_offsets_in_counts(options, unit, per_g, scale):
     assert all(' rounds the ' in each or each.startswith('iNav leaves ') for each in losses)
 
 
+@pytest.mark.parametrize('given', [
+    {'name': 'imu'}, {'instance': 2}, {'device_id': 7}, {'axes': 'flu'}, {'counts_per_g': 900.0},
+    {'noise': NOISE}])
+def test_an_option_changes_the_file_or_is_refused(given):
+    made = {unit: sensor_with(BY_AXIS, unit=unit, per_g=per_g)
+            for unit, per_g in (('m/s2', None), ('native', 1000.0))}
+    taken = set()
+    for to, unit in product(EXPORT_FORMATS, made):
+        options = {'noise': NOISE, **given} if 'noise' in EXPORT_FORMATS[to].takes else given
+        with suppress(InputError):
+            text = text_of(made[unit], to, **options)
+            taken.add(to)
+            assert 'noise' in options or text != text_of(made[unit], to)
+    assert taken == {to for to, each in EXPORT_FORMATS.items() if {*given} <= {*each.takes}}
+    with pytest.raises(InputError, match='takes no --'):
+        text_of(made['m/s2'], 'json', **given)
+
+
 def imu_calib(text, raw):
     """Correct readings by SM and bias, in the unit of the readings."""
     found = yaml.safe_load(text)
@@ -365,7 +385,8 @@ def test_a_program_corrects_from_its_file_as_apply_does(user, unit, per_g, seed)
     count = made.units.per_g / 2048 if per_g is None else 1.0
     reading = np.round(samples(made)[0] / count) * count
     raw = reading / count / 2048 * {'g': 1.0, 'm/s2': 9.80665}.get(needed, 2048 * count)
-    found = export(made, user.__name__, NOISE)
+    noise = NOISE if 'noise' in EXPORT_FORMATS[user.__name__].takes else None
+    found = export(made, user.__name__, noise)
     force = user(found.text_or_bytes, raw) / {
         'm/s2': 9.80665, 'like apply': made.force_per_g}.get(needed, 1.0)
     np.testing.assert_allclose(force, made.apply(reading) / made.force_per_g, atol=most)
@@ -484,9 +505,12 @@ def test_the_command_writes_beside_the_calibration(to, stored, tmp_path, capsys)
     before = given.read_bytes()
     for _ in range(2):  # the second time, it replaces its own file
         capsys.readouterr()
-        assert run('export', given, '--to', to, '--noise', noise) == 0
+        assert run('export', given, '--to', to, *(
+            ('--noise', noise) if 'noise' in EXPORT_FORMATS[to].takes else ())) == 0
     path = tmp_path / f'calibration{EXPORT_FORMATS[to].suffix}'
-    wanted = export(read_calibration(given), to, NOISE, ExportOptions(name='calibration'))
+    takes = EXPORT_FORMATS[to].takes
+    wanted = export(read_calibration(given), to, NOISE if 'noise' in takes else None,
+                    ExportOptions(**{'name': 'calibration'} if 'name' in takes else {}))
     assert path.read_bytes() == wanted.data
     assert given.read_bytes() == before
     printed = capsys.readouterr()

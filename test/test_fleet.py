@@ -227,6 +227,26 @@ def test_a_second_run_calibrates_what_is_new_and_all_with_other_options(
             str(path.relative_to(store.folder)) for path in files}
 
 
+def test_a_copy_counts_once_and_a_moved_recording_leaves_its_sensor(
+        client: Any, tmp_path: Path) -> None:
+    folder, store = write_fleet(tmp_path / 'in', 2, 2), Store(tmp_path / 'out')
+    first, second = (folder / f'robot_{k}' / '2026-01-03.csv' for k in range(2))
+    changes: list[tuple[Callable[[], Any], dict[str, int], list[int]]] = [
+        (lambda: shutil.copy(first, folder / 'robot_0' / 'copy.csv'), {'ok': 4, 'skipped': 1},
+         [2, 2]),
+        (lambda: shutil.copy(first, folder / 'robot_1' / 'copy.csv'), {'ok': 1, 'skipped': 5},
+         [2, 3]),
+        (lambda: None, {'skipped': 6}, [2, 3]),
+        (lambda: second.rename(folder / 'robot_0' / 'moved.csv'), {'ok': 1, 'skipped': 5},
+         [3, 2])]
+    for change, counts, rows in changes:
+        change()
+        assert run(client, found_in(folder), QUICK, store).counts == counts
+        sensors = [row['sensor'] for row in rows_of(store.folder)]
+        assert [sensors.count(f'robot_{k}/imu_link') for k in range(2)] == rows
+        assert len([*(store.folder / 'calibrations').rglob('*.yaml')]) == len(sensors)
+
+
 def test_the_weather_changes_no_value_of_a_sensor(tmp_path: Path) -> None:
     effects, rows = {'offset': OFFSET, 'offset_temperature': (0.001, -0.001, 0.0005)}, []
     for month, limits in enumerate(((0.0, 20.0), (20.0, 50.0)), 1):

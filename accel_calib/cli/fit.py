@@ -380,12 +380,13 @@ def run_simulate(args: argparse.Namespace) -> Done:
 
 def run_export(args: argparse.Namespace) -> Done:
     """Write the file, and print what it does not hold on standard error."""
-    from ..stored.exports import export, identifier, Options, read_noise
+    from ..stored.exports import export, FORMATS, identifier, Options, read_noise
 
     calibration = stored_calibration(args.calibration, args.own)
     is_file = args.output != STANDARD_OUTPUT
     named = args.output if is_file and args.output is not None else args.calibration
-    chosen = Options(**{**given(Options, args), 'name': args.name or identifier(Path(named).stem)})
+    own = identifier(Path(named).stem) if 'name' in FORMATS[args.to].takes else ''
+    chosen = Options(**{**given(Options, args), 'name': args.name or own})
     noise = None if args.noise is None else read_noise(args.noise)
     made = export(calibration, args.to, noise, chosen)
     target = (args.calibration.with_name(f'{args.calibration.stem}{made.suffix}')

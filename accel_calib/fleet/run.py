@@ -214,19 +214,21 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
             files, _in_order(client, is_damaged, files), strict=True) if is_so)
         store.forget_lost()
         _merge(client, store, options.own)  # what an interrupted run left
-        counts, unread = Counter[str](), list[Row]()
+        counts, unread, done = Counter[str](), list[Row](), set[str]()
         calibrate = partial(calibrate_recording, limit_s=limit_s)
-        for item, status in mapped(client, calibrate, found, options, store):
-            if isinstance(status, Exception):  # not of the recording, unless workers died
-                if not isinstance(status, KilledWorker):
-                    raise status
-                status = unread_row(item, options, InputError(
+        for item, row in mapped(client, calibrate, found, options, store):
+            if isinstance(row, Exception):  # not of the recording, unless workers died
+                if not isinstance(row, KilledWorker):
+                    raise row
+                row = unread_row(item, options, InputError(
                     'the workers that calibrated this recording died, expected them to finish',
                     'give the workers more memory, and run again'))
-            if not isinstance(status, str):
-                unread.append(status)
-                status = 'unread'
-            counts[status] += 1
+            key = row.get('key', '')
+            counts['skipped' if key in done else row['status']] += 1  # a copy is in no other row
+            if key:
+                done.add(key)
+            else:
+                unread.append(row)
             progress(sum(counts.values()), len(found))
         if unread or store.data(UNREAD).exists():
             write_parquet(store.data(UNREAD), unread, schema())
@@ -372,11 +374,11 @@ _apart = threading.local()
 """The process of each thread in which recordings are calibrated, so that it can be ended."""
 
 
-def calibrate_recording(found: Input, options: Options, store: Store, limit_s: float) -> str | Row:
+def calibrate_recording(found: Input, options: Options, store: Store, limit_s: float) -> Row:
     """
-    Calibrate one recording, add the result to the store, and return what happened to it.
+    Calibrate one recording, add the result to the store, and return its key and its status.
 
-    The row is returned, and not stored, if the recording cannot be read, takes longer than
+    The whole row is returned, and not stored, if the recording cannot be read, takes longer than
     `limit_s` [s], or ends in any other error. OSError is raised if the result cannot be written.
 
     """
@@ -386,7 +388,7 @@ def calibrate_recording(found: Input, options: Options, store: Store, limit_s: f
             content = content_hash(path)
             key = key_of(content, found, options)
             if store.mark(key).exists():
-                return 'skipped'
+                return {'key': key, 'status': 'skipped'}
             if not hasattr(_apart, 'process'):
                 _apart.process = WorkerProcess(idle=False)  # ends with this process
             row, calibration = _apart.process.call(row_of, found, path, options, limit_s=limit_s)
@@ -398,7 +400,7 @@ def calibrate_recording(found: Input, options: Options, store: Store, limit_s: f
             row['calibration'] = name
             row['warnings'] += _exported(calibration, store.folder / name, options.exports)
         store.add(row)
-        return str(row['status'])
+        return {'key': key, 'status': row['status']}
     except Exception as err:  # one recording must not stop the others
         if row and isinstance(err, OSError):
             raise

@@ -92,16 +92,17 @@ class Store:
         """
         Write a row, to be merged into the data set; raise OSError if it fails.
 
-        It is written for its sensor, and for the one that has the recording so far. ValueError is
-        raised for a row that the data set cannot hold.
+        It is written for its sensor, and for those that have the recording or its content so far.
+        ValueError is raised for a row that the data set cannot hold.
 
         """
         import pyarrow as pa
 
         text, names = json.dumps(row), {as_folder(row['sensor'])}
         pa.Table.from_pylist([json.loads(text)], schema())
-        if (place := self.place(row['recording'])).exists():
-            names.add(place.read_text(encoding='utf-8').partition('\n')[0])
+        for place in map(self.place, (row['recording'], row['content'])):
+            if place.exists():
+                names.add(place.read_text(encoding='utf-8').partition('\n')[0])
         for name in names:
             path = self.folder / 'pending' / name / f'{row["key"]}.json'
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -116,8 +117,9 @@ class Store:
         Add the pending rows of a sensor, by the name of its folder, to its Parquet file.
 
         They replace rows of the same content, and rows of the same recording that have an error.
-        A pending row of another sensor replaces the row of the recording here. The rows are in
-        order of date. If it raises OSError, the next `merge` completes it.
+        A pending row of another sensor replaces the row of the recording here, also of one that
+        has been moved. The rows are in order of date. If it raises OSError, the next `merge`
+        completes it.
 
         """
         folder, data = self.folder / 'pending' / name, self.data(name)
@@ -128,9 +130,13 @@ class Store:
         contents = {row['recording']: row['content'] for row in new}
         old, added = read_parquet(data), [row for row in new if as_folder(row['sensor']) == name]
         newest = {row['content']: row for row in added}
-        rows = [*newest.values(), *(row for row in old if row['content'] not in newest and (
-            row['recording'] not in contents
-            or (row['status'] == 'ok' and row['content'] != contents[row['recording']])))]
+        moved = {*contents.values()} - {*newest}  # perhaps; a copy is still there, too
+        rows = [*newest.values(), *(
+            row for row in old if row['content'] not in newest
+            and (row['content'] not in moved or '://' in row['recording']
+                 or Path(row['recording']).exists())
+            and (row['recording'] not in contents or (
+                row['status'] == 'ok' and row['content'] != contents[row['recording']])))]
         if rows:
             write_parquet(data, sorted(rows, key=lambda row: (
                 row['date'] or '', row['recording'])), schema())
@@ -141,7 +147,8 @@ class Store:
             for path in (self.folder / 'calibrations' / name).glob(f'{key}*'):
                 path.unlink(missing_ok=True)
         for row in added:
-            for mark in (self.mark(row['key']), self.place(row['recording'])):
+            for mark in (self.mark(row['key']), *map(
+                    self.place, (row['recording'], row['content']))):
                 mark.parent.mkdir(parents=True, exist_ok=True)
                 mark.write_text(f'{name}\n{row.get("calibration", "")}', encoding='utf-8')
 
@@ -200,9 +207,9 @@ class Store:
         """Return the file that is there if the result with this key is in the data set."""
         return self.folder / 'done' / key[:2] / key
 
-    def place(self, recording: str) -> Path:
-        """Return the file with the folder of the sensor that has this recording."""
-        return self.mark(blake2b(recording.encode(), digest_size=16).hexdigest())
+    def place(self, name: str) -> Path:
+        """Return the file with the folder of the sensor that has this recording, or content."""
+        return self.mark(blake2b(name.encode(), digest_size=16).hexdigest())
 
 
 def write_parquet(path: Path, rows: list[Row], columns: pa.Schema) -> None:

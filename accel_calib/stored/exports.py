@@ -12,7 +12,7 @@ and fills the template.
 
 from collections.abc import Mapping
 import csv
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 import io
 import json
@@ -47,6 +47,7 @@ Quantities keep their name."""
 _GITHUB = 'https://github.com/'
 _ALL = 'offset, gains, mounting'
 _BY_AXIS = 'offset, gain of each axis, thermal offset'
+_OF_AUTOPILOT, _OF_COUNTS = ('instance', 'device_id', 'axes'), ('axes', 'counts_per_g')
 _OF_FILE = 'that of the [file](files.md#calibration)'
 
 
@@ -90,32 +91,32 @@ FORMATS: Mapping[str, Format] = MappingProxyType({
     'c': Format(
         'C header', '.h', 'header in C99 and C++, single precision',
         equation='force = M (raw - B), and [more](#c-and-arduino)', holds='all but lag, time, '
-        'supply and rotation', make=header, needs='options'),
+        'supply and rotation', make=header, takes=('name',)),
     'arduino': Format(
         'Arduino header', '.h', 'header for an Arduino sketch', equation='as `c`', holds='as `c`',
-        make=header, needs='options'),
+        make=header, takes=('name',)),
     'px4': Format(
         'PX4', '_px4.params', 'parameter file of QGroundControl',
         equation='(raw - thermal(T - TREF) - OFF) SCALE', holds=_BY_AXIS, make=px4,
-        needs='options', metric=True, source=_GITHUB + 'PX4/PX4-Autopilot/blob/main/src/lib/'
+        takes=_OF_AUTOPILOT, metric=True, source=_GITHUB + 'PX4/PX4-Autopilot/blob/main/src/lib/'
         'sensor_calibration/Accelerometer.hpp'),
     'ardupilot': Format(
         'ArduPilot', '_ardupilot.param', 'parameter file of Mission Planner and MAVProxy',
         equation='(raw - p(T - 35) + p(CALTEMP - 35) - OFFS) SCAL', holds=_BY_AXIS, make=ardupilot,
-        needs='options', metric=True, source=_GITHUB + 'ArduPilot/ardupilot/blob/master/libraries/'
-        'AP_InertialSensor/AP_InertialSensor_Backend.cpp'),
+        takes=_OF_AUTOPILOT, metric=True, source=_GITHUB + 'ArduPilot/ardupilot/blob/master/'
+        'libraries/AP_InertialSensor/AP_InertialSensor_Backend.cpp'),
     'betaflight': Format(
         'Betaflight', '_betaflight.txt', 'commands for its command line',
         equation='(raw - acc_calibration) / acc_1G', holds='offset in counts',
         make=partial(counts, label='Betaflight'),
         source=_GITHUB + 'betaflight/betaflight/blob/master/src/main/sensors/acceleration.c',
-        needs='options'),
+        takes=_OF_COUNTS),
     'inav': Format(
         'iNav', '_inav.txt', 'commands for its command line', equation='(raw - acczero) accgain / '
         '4096 / acc_1G', holds='offset, gain of each axis',
         make=partial(counts, label='iNav', with_gain=True),
         source=_GITHUB + 'iNavFlight/inav/blob/master/src/main/sensors/acceleration.c',
-        needs='options'),
+        takes=_OF_COUNTS),
     'mpu6050': Format(
         'MPU-6050', '_mpu6050.h', 'change of the offset registers; MPU-6500 and 9250, too',
         equation='raw + change, in 1/2048 g', holds='offset in 0.98 mg',
@@ -123,7 +124,7 @@ FORMATS: Mapping[str, Format] = MappingProxyType({
             'add the change to the words that the chip has after power-on, each time, and verify '
             'it with new poses: drivers state 1/2048 g, but also 1/4096 g for the MPU-6050',)),
         source='RM-MPU-9250A-00 rev. 1.4, section 4.39, and mpu_set_accel_bias_6050_reg of '
-        'InvenSense', needs='options'),
+        'InvenSense', takes=('name', *_OF_COUNTS)),
     'fusion': Format(
         'Fusion', '_fusion.h', 'parameters of FusionCalibrationInertial by x-io',
         equation='force = misalignment ((raw - offset) * sensitivity)', holds=_ALL,
@@ -141,7 +142,7 @@ FORMATS: Mapping[str, Format] = MappingProxyType({
         equation='force = R_IMUtoACC^T Ta^-1 (raw - estimated bias)', holds='gains, noise',
         make=openvins,
         source=_GITHUB + 'rpng/open_vins/blob/master/ov_msckf/src/state/Propagator.cpp',
-        needs='noise', metric=True),
+        takes=('noise',), metric=True),
     'dlio': Format(
         'DLIO', '_dlio.yaml', 'parameters of its ROS 2 node', equation='force = sm raw - bias',
         holds='offset, gains, gyro bias',
@@ -160,11 +161,11 @@ FORMATS: Mapping[str, Format] = MappingProxyType({
     'kalibr': Format(
         'Kalibr', '_imu.yaml', 'imu.yaml with the noise', equation='none', holds='noise',
         make=partial(noise_alone, label='Kalibr'),
-        source=_GITHUB + 'ethz-asl/kalibr/wiki/IMU-Noise-Model', needs='noise'),
+        source=_GITHUB + 'ethz-asl/kalibr/wiki/IMU-Noise-Model', takes=('noise',)),
     'vins': Format(
         'VINS', '_vins.yaml', 'lines of the noise for its configuration', equation='none',
         holds='noise', make=partial(noise_alone, label='VINS'),
-        needs='noise', source=_GITHUB + 'HKUST-Aerial-Robotics/VINS-Fusion/blob/master/'
+        takes=('noise',), source=_GITHUB + 'HKUST-Aerial-Robotics/VINS-Fusion/blob/master/'
         'vins_estimator/src/factor/integration_base.h'),
     'json': Format(
         'JSON', '.json', 'all values', equation=_OF_FILE, holds='everything', make=_whole),
@@ -173,7 +174,7 @@ FORMATS: Mapping[str, Format] = MappingProxyType({
         make=partial(_whole, as_arrays=True))})
 """The formats by name."""
 
-CALIBRATION_ALONE = tuple(name for name, each in FORMATS.items() if each.needs != 'noise')
+CALIBRATION_ALONE = tuple(name for name, each in FORMATS.items() if 'noise' not in each.takes)
 """Formats that need nothing but the calibration."""
 
 
@@ -226,7 +227,8 @@ def export(calibration: Calibration, to: str, noise: Noise | None = None,
     Raises
     ------
     InputError
-        If the format cannot hold the calibration at all, or needs what is not given.
+        If the format cannot hold the calibration at all, needs what is not given, or does not take
+        what is.
     ValueError
         If there is no such format.
 
@@ -234,7 +236,13 @@ def export(calibration: Calibration, to: str, noise: Noise | None = None,
     if to not in FORMATS:
         raise ValueError(f'format is {to!r}, expected one of {", ".join(FORMATS)}')
     chosen = FORMATS[to]
-    beside = {'': (), 'options': (options,), 'noise': (noise,)}[chosen.needs]
+    asked = ['noise'] * (noise is not None) + [
+        each.name for each in fields(options) if getattr(options, each.name) != each.default]
+    for name in (each for each in asked if each not in chosen.takes):
+        raise InputError(f'{chosen.label} takes no --{name.replace("_", "-")}', 'leave it out; '
+                         f'{", ".join(each for each in FORMATS if name in FORMATS[each].takes)} '
+                         'take it')
+    beside = (noise if chosen.takes == ('noise',) else options,) if chosen.takes else ()
     if chosen.metric and calibration.units.is_native:
         raise InputError(
             f'the calibration is for native readings, but {chosen.label} corrects readings in '

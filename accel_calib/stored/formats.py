@@ -373,6 +373,9 @@ def counts(calibration: Calibration, options: Options, label: str, with_gain: bo
 
     """
     signs, units, per_g = _SIGNS[options.axes], calibration.units, options.counts_per_g
+    if per_g is not None and register_per_g is not None and not units.is_native:
+        raise InputError(f'{label} takes --counts-per-g for native readings, but those of the '
+                         f'calibration are in {units.name}', 'leave it out')
     if per_g is None:  # a power of two near that of the readings
         per_g = (float(2.0 ** np.round(np.log2(units.per_g))) if units.is_native
                  else _COUNTS_PER_G)

@@ -106,8 +106,8 @@ class Format:
     `label` is the name of what reads the file, `suffix` the end of its name, `what` its content in
     a few words, `equation` how the reader corrects, `holds` which effects it has, and `source` the
     definition of the format; empty for formats of this package. `make` returns the values of a
-    calibration for the template. What it `needs` beside is ``options``, or the ``noise`` of the
-    sensor. A `metric` reader takes readings in m/s² only.
+    calibration for the template. What it `takes` beside are fields of `Options`, or the ``noise``
+    of the sensor, which it needs. A `metric` reader takes readings in m/s² only.
 
     """
 
@@ -118,7 +118,7 @@ class Format:
     holds: str
     make: Callable[..., Made]
     source: str = ''
-    needs: str = ''
+    takes: tuple[str, ...] = ()
     metric: bool = False
 
 
