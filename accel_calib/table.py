@@ -398,7 +398,7 @@ def check_values(columns: Mapping[str, NDArray[Any]], source: str,
     for key, values in columns.items():
         if key not in COLUMNS or key == 'label':
             continue
-        by_row = values.reshape(len(values), -1)
+        by_row = values[:, np.newaxis] if values.ndim == 1 else values
         low, high, words = _LIMITS.get(key, (-LARGEST, LARGEST, f'below {LARGEST:g}'))
         sound = (low < by_row) & (by_row < high) | (partial and key in CONTEXT) & np.isnan(by_row)
         if not np.all(sound):

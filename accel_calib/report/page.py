@@ -25,7 +25,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -325,10 +325,13 @@ def write_figures(folder: Path, result: Refinement) -> list[Path]:
     for drawing in all_drawings(result):
         for suffix in ('svg', 'png'):
             paths.append(folder / f'{drawing.name}.{suffix}')
-            save = partial(drawing.figure.savefig, format=suffix, dpi=160, facecolor='white')
             with styled():
-                write_atomically(paths[-1], lambda file, save=save: save(file.buffer))
+                write_atomically(paths[-1], partial(_save, drawing, suffix))
     return paths
+
+
+def _save(drawing: Drawing, suffix: str, file: TextIO) -> None:
+    drawing.figure.savefig(file.buffer, format=suffix, dpi=160, facecolor='white')
 
 
 def draw_step(result: Refinement, kept: Residuals, step: int) -> Iterator[Drawing]:
