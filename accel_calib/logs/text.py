@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .columns import (
-    Cells, choose_columns, Dialect, EPOCH_S, is_clock, is_log_header, is_number, LABEL,
+    Cells, choose_columns, Dialect, EMPTY, EPOCH_S, is_clock, is_log_header, is_number, LABEL,
     LABELLED_UNIT, LogOptions, MONITOR, RATES_HZ, short, TextLayout, UNREADABLE)
 from .quantities import decide_quantities
 from ..disk import write_atomically
@@ -434,7 +434,7 @@ class TextTable:
         if len(cells) != layout.width:
             return f' has {counted(len(cells), "value")}, expected {layout.width}'
         comma = layout.decimal != '.' and (layout.dialect.delimiter != ',' or '"' in line)
-        present = [k for k in self.columns.context if cells[k].strip()]
+        present = [k for k in self.columns.context if cells[k].casefold() not in EMPTY]
         for k in (*self.columns.needed, *present):
             if not is_number(cells[k].replace(',', '.') if comma else cells[k]):
                 return (f', column {layout.name(k)} is {short(cells[k])!r}, expected a finite '
