@@ -36,7 +36,7 @@ from .logs import Frame, LogOptions, open_log, OpenLog, Piped, Progress
 from .stillness import (
     account_of, capture, Captured, CaptureSettings, cells_of, check_measured, is_one_direction,
     is_turned_over, LEAST_RANGE, LEAST_RESTS, Ramp, ramp_of, rests_in_cells, settings_from)
-from .table import check_units, Poses, range_of, Recording, Table
+from .table import check_units, CONTEXT, Poses, range_of, Recording, Table
 from .text import counted, now, short
 from .units import FrameName, Method, UnitName, Units, units_of
 
@@ -542,7 +542,9 @@ class Correction:
     def context(self, samples: Table) -> Context:
         """Return the context of the next block, as the effects need it."""
         model = self.calibration.model
-        found = context_of_samples(samples.columns, len(samples), model, self._thermal)
+        known = {key: values for key, values in samples.columns.items()
+                 if key not in CONTEXT or not np.any(np.isnan(values))}
+        found = context_of_samples(known, len(samples), model, self._thermal)
         self._lacking = ''
         if lacking := [key for key in model.neutral if key not in samples]:
             names = [str(each) for each in model.effects if {*entry_of(each).needs} & {*lacking}]

@@ -16,13 +16,15 @@ from pathlib import Path
 import re
 import stat
 
+import accel_calib as ac
 from accel_calib.calibration import Calibration, fit_poses, Rejected
 from accel_calib.disk import write_atomically
 from accel_calib.effects import OwnEffect
 from accel_calib.errors import (
     AccelCalibError, DamagedCalibrationError, InputError, StoredCalibrationError)
 from accel_calib.finding import has
-from accel_calib.logs import read_poses, write_table
+from accel_calib.logs import open_log, read_poses, write_table
+from accel_calib.pipeline import Correction
 from accel_calib.stored import read_calibration, read_prior, write_calibration
 from accel_calib.table import COLUMNS, numbered, Poses
 from faults.fuzz import LONGEST_LINE
@@ -339,3 +341,25 @@ def test_a_number_is_read_as_yaml_reads_it() -> None:
     text = yaml.safe_dump({'a': numbers, 'b': [True, False, None, float('inf')]})
     assert read_plain(text) == yaml.safe_load(text) == {
         'a': numbers, 'b': [True, False, None, float('inf')]}
+
+
+@pytest.mark.parametrize('name', ['temperature', 'Temp (°C)'])
+@pytest.mark.parametrize('empty', ['', 'nan', 'N/A'])
+def test_the_temperature_of_a_slower_thermometer_is_known_at_each_sample(name, empty, tmp_path):
+    made = ac.simulate({'offset_temperature': 0.002}, recording=True, poses=24, seed=8,
+                       temperature=(18.0, 40.0))
+    warm = [f'{each:.3f}' if k % 97 == 3 else empty
+            for k, each in enumerate(made['temperature'])]
+    rows = [f'{time:.2f},{x:.5f},{y:.5f},{z:.5f},{each}' for time, (x, y, z), each in zip(
+        made['time'], made.reading, warm, strict=True)]
+    log = tmp_path / 'log.csv'
+    log.write_text('\n'.join([f'time,ax,ay,az,{name}', *rows, '']))
+    read = ac.read_recording(log)
+    assert len(read) == len(made)
+    assert read['temperature'][97:-97] == pytest.approx(made['temperature'][97:-97], abs=1e-3)
+    calibration = ac.calibrate(log)
+    assert 'offset_temperature' in calibration.model.effects
+    calibration.save(tmp_path / 'c.yaml')
+    log.write_text('time,ax,ay,az,temperature\n0,0,0,9.8,\n0.01,0,0,9.8,\n0.02,0,0,9.8,\n')
+    with pytest.raises(InputError, match='need temperature'), open_log(log) as without:
+        [*map(Correction(calibration, without.units, ''), without.blocks)]

@@ -43,6 +43,9 @@ BY_ORDER: Mapping[int, tuple[str, ...]] = {
 OF_POSES = {'count', 'orientation', 'std'}
 """Columns that only poses have."""
 
+_EMPTY = ('', 'nan', 'na', 'n/a', 'null', 'none')
+"""Texts of a cell of the context without a number."""
+
 _FIRST_ROWS = 5
 """Number of rows that show whether a column has numbers, dates or other text."""
 
@@ -255,7 +258,7 @@ class Chosen:
 
     All are indices of columns. `sources` are those of a key of `COLUMNS`; those of ``KEY/`` divide
     the ones of a key, and ``instance`` is the number of the sensor. The others are the columns of
-    numbers that each row needs, those of the `context` that poses may lack, `dates` (times as
+    numbers that each row needs, those of the `context`, which a row may lack, `dates` (times as
     text), and further columns of numbers, the `quantities`.
 
     """
@@ -287,8 +290,8 @@ def is_number(text: str) -> bool:
 
 
 def is_filled(cell: str) -> bool:
-    """Return whether a cell is neither empty nor NaN, as programs write one without a number."""
-    return cell.casefold() not in ('', 'nan')
+    """Return whether a cell is not one of those that programs write without a number."""
+    return cell.casefold() not in _EMPTY
 
 
 def is_clock(text: str) -> bool:
@@ -333,7 +336,7 @@ def choose_columns(layout: TextLayout, options: LogOptions) -> Chosen:
     texts = {'label', 'time'} if dates else {'label'}
     needed = {k for key, which in sources.items() if key not in texts for k in which}
     of_poses = options.partial or bool(OF_POSES & sources.keys())
-    context = {k for key in CONTEXT for k in sources.get(key, ())} if of_poses else set[int]()
+    context = {k for key in CONTEXT for k in sources.get(key, ())}
     used = {k for which in sources.values() for k in which}
     quantities: dict[str, int] = {}  # the other columns of numbers that can be a cause
     for k, name in enumerate(() if maker else layout.header[:MOST]):
@@ -408,7 +411,8 @@ def _sources(layout: TextLayout, given: Mapping[str, str]) -> dict[str, int]:
     # What is not asked for, and holds other text than numbers, does not stand in the way.
     return {ours: k for ours, k in found.items() if given.get(ours, ours) and (
         ours not in (*RATE, *CONTEXT) or ours in given or layout.name(k) == ours
-        or _are_numbers(layout.first(k)[:_FIRST_ROWS]))}
+        or _are_numbers([cell for cell in layout.first(k)[:_FIRST_ROWS] if not (
+            ours in CONTEXT and not is_filled(cell))]))}
 
 
 def column(layout: TextLayout, theirs: str) -> int:

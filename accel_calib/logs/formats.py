@@ -12,7 +12,7 @@ name the program that converts it.
 
 """
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -39,7 +39,7 @@ from .times import check_order
 from ..disk import check_regular, FIRST_LINE
 from ..errors import DamagedLogError, InputError, needing, saying
 from ..finding import Finding
-from ..table import check_units, check_values, concatenated, CONTEXT, Poses, Recording
+from ..table import check_units, check_values, concatenated, CONTEXT, Floats, Poses, Recording
 from ..text import counted
 from ..units import Units, units_of
 
@@ -243,8 +243,8 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
         first, *rest = (each.take(slice(None, None, -1)) for each in [first, *cells][::-1])
         cells = iter(rest)
     about = {**text.layout.about, 'units': quantities.units.name}
-    blocks = (Poses(*quantities.columns(block, str(path), partial=bool(text.columns.context)),
-                    **about) for block in chain((first,), cells))
+    blocks = (Poses(*quantities.columns(block, str(path)), **about)
+              for block in chain((first,), cells))
     poses = None
     samples: Iterator[Recording]
     with saying(', '.join(quantities.said)):
@@ -252,7 +252,7 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
         check_units(head, quantities.units, str(path))
         if 'time' in head and are_samples(head.columns):
             check_order(head['time'], head.reading, str(path))
-            samples = (Recording(**vars(block)) for block in chain((head,), blocks))
+            samples = _without_empty_cells(chain((head,), blocks))
             count = len(head)
             if text.more:  # the size of the file, and the rows of this block, tell about how many
                 width = 2 if text.layout.encoding.startswith('utf-16') else 1
@@ -273,6 +273,21 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
         blocks=samples, samples=count, units=quantities.units, sensor=head.sensor,
         read_as=', '.join([*quantities.said, *rate]), poses=poses,
         noted=lambda: (*text.notes, *quantities.all_notes), findings=tuple(quantities.findings))
+
+
+def _without_empty_cells(blocks: Iterable[Poses]) -> Iterator[Recording]:
+    """Yield samples; the context of a slower sensor is interpolated where it has empty cells."""
+    last = dict[str, Floats]()
+    for block in blocks:
+        columns = {key: block[key] for key in CONTEXT if key in block}
+        for key, values in columns.items():
+            known = np.flatnonzero(np.isfinite(values))
+            place = np.concatenate([np.full(len(last.get(key, [])), -1), known])
+            last[key] = np.concatenate([last.get(key, np.zeros(0)), values[known]])
+            if len(place):
+                columns[key] = np.interp(np.arange(len(values)), place, last[key])
+            last[key] = last[key][-1:]
+        yield Recording(**vars(block.with_columns(**columns)))
 
 
 def _without_holes(poses: Poses, findings: list[Finding]) -> Poses:

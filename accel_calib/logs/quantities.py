@@ -138,9 +138,14 @@ class Quantities:
         again = f'the clock starts again {times} at the end of its range; its times are continued'
         return (*self.notes, again) if starts else tuple(self.notes)
 
-    def columns(self, cells: Cells, source: str, *, partial: bool = False
+    def columns(self, cells: Cells, source: str
                 ) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:
-        """Return the columns of a block in our units, and its row numbers; see `check_values`."""
+        """
+        Return the columns of a block in our units, and its row numbers; empty cells are NaN.
+
+        See `check_values` for the errors.
+
+        """
         cells, columns = self.of_instance(cells), dict[str, NDArray[Any]]()
         for key, own in self.chosen.sources.items():
             if key == 'label':
@@ -156,7 +161,7 @@ class Quantities:
         columns |= {key: cells.numbers[k] for key, k in self.chosen.quantities.items()}
         if self.rate_hz is not None:
             columns['time'] = (cells.row - 1) / self.rate_hz
-        check_values(columns, source, cells.row, partial=partial)
+        check_values(columns, source, cells.row, partial=True)
         return columns, cells.row
 
     def of_instance(self, cells: Cells) -> Cells:
