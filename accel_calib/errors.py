@@ -84,6 +84,14 @@ class RefusedFitError(AccelCalibError):
     """The poses do not determine the model, or the result is not plausible."""
 
 
+class TooFewPosesError(RefusedFitError):
+    """The poses do not determine the model; `advice` asks for others, and `offer` is possible."""
+
+    def __init__(self, message: str, advice: str, offer: str = '') -> None:
+        super().__init__(message, advice + offer)
+        self.offer = offer
+
+
 class StoredCalibrationError(AccelCalibError):
     """A stored calibration has another version, or belongs to another sensor."""
 

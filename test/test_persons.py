@@ -14,7 +14,8 @@ from typing import Any
 
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.session import (
-    BUTTONS, conditions, enable, figures as health_figures, next_step, progress, Surroundings)
+    BUTTONS, conditions, diagnostics, enable, figures as health_figures, next_step, progress,
+    Surroundings, words_of_state)
 from driven import Driver, GRAVITY, Person
 from inside import spread_directions
 import numpy as np
@@ -160,6 +161,8 @@ def test_a_calibration_that_cannot_be_stored_leaves_no_file_and_is_asked_for_unt
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
         driver.refuses('could not be stored', 'fit')
+        person.rest([0.5, 0.5, -0.7])
+        assert 'the poses could not be stored' in diagnostics(driver.session.state)[-1].words
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     folder = driver.session.state.files.store.calibration.parent
@@ -170,6 +173,7 @@ def test_a_calibration_that_cannot_be_stored_leaves_no_file_and_is_asked_for_unt
     assert conditions(driver.session.state)[0].level == 'BAD'
     driver.ask('save')
     assert next_step(driver.session.state).kind == 'level'
+    assert diagnostics(driver.session.state)[-1].level == 'GOOD'
 
 
 def test_an_assumed_temperature_is_that_of_messages_and_mounting_and_not_of_drift() -> None:
@@ -180,13 +184,43 @@ def test_an_assumed_temperature_is_that_of_messages_and_mounting_and_not_of_drif
     person = Person(driver, warming)
     person.rest([0.2, 0.1, 1.0], 12.0)
     assert driver.sensor.drift.count == 0
-    assert 'no_value' in [each.kind for each in conditions(driver.session.state)]
+    assert 'not compared: the rests have no temperature' in [
+        each.words for each in diagnostics(driver.session.state)]
     driver.ask('set_level')
     gravity = driver.session.state.gravity
     reading = warming([0.2, 0.1, 1.0], 25.0) * GRAVITY
     force = driver.sensor.force_of(tuple(reading), driver.session.state.context)
     np.testing.assert_allclose(gravity / GRAVITY, force, atol=1e-3)
     np.testing.assert_allclose(gravity[:2], 0.0, atol=1e-2)
+
+
+def test_no_pose_is_asked_for_after_the_end_of_a_recording() -> None:
+    driver = Driver()
+    person = Person(driver, reading())
+    driver.session.change(surroundings=Surroundings(publishers=None, ended=True))
+    assert next_step(driver.session.state).text.startswith('in another recording, turn the sensor')
+    assert words_of_state(driver.session.state) == 'waiting for the first message'
+    for up in spread_directions(12):
+        person.rest(up)
+    assert next_step(driver.session.state).text == 'no more poses can come; call ~/fit'
+    assert words_of_state(driver.session.state) == 'no calibration'
+    driver.refuses('the samples have ended', 'capture_pose', 'set_level')
+
+
+def test_a_refusal_that_passes_with_the_moment_is_no_next_step() -> None:
+    driver = Driver()
+    person = Person(driver, reading())
+    for up in spread_directions(12):
+        person.rest(up)
+    driver.ask('fit')
+    step = next_step(driver.session.state)
+    driver.now += 0.7
+    driver.refuses('arrived 0.7 s ago', 'set_level')
+    driver.now -= 0.7
+    driver.feed(np.random.default_rng(1).normal(size=(50, 3)) + GRAVITY / 3.0 ** 0.5)
+    driver.refuses('is not still|1 g at rest', 'set_level', 'calibrate_at_rest')
+    assert next_step(driver.session.state) == step
+    assert step.command == 'set_level'
 
 
 def test_no_step_is_named_while_the_rating_is_being_computed() -> None:
@@ -208,6 +242,10 @@ def test_a_step_offers_no_fit_of_the_same_poses_and_names_a_pose_after_each_refu
     person = Person(driver, lambda up, warm: healthy(up, warm) + 0.01 * np.asarray(up)[[1, 2, 1]])
     for up in [*np.eye(3), *-np.eye(3), [0.6, 0.8, 0.0], [0.0, -0.6, 0.8]]:
         person.rest(up)
+        if len(driver.poses) < 3:  # both ask for the same pose
+            with pytest.raises(RefusedFitError) as refused:
+                driver.ask('fit')
+            assert refused.value.advice in next_step(driver.session.state).text
     for command in ('fit', 'refine'):
         driver.refuses('not used', command)
         step = next_step(driver.session.state)

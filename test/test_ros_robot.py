@@ -153,6 +153,9 @@ def test_topics_of_imus_and_thermometers_that_exist_are_named(bench: Any) -> Non
 
     bench.spin(lambda: said('no Imu messages on /elsewhere', 'such as /arm/imu'))
     bench.calibrator()
+    bench.run(*NODES['calibrator'], '--ros-args', '-r', 'imu/data_raw:=/far')  # beside another
+    bench.spin(lambda: said('no Imu messages on /far', 'such as /arm/imu'))
+    assert not said('such as', '/preview')
 
     bench.send_until(lambda: bench.imu([0.1, 0.2, 9.8]), lambda: said(
         'no temperature arrives', 'temperature:=/board/temperature'))
@@ -253,12 +256,16 @@ def test_the_managed_node_loads_and_has_a_page_on_configure_and_publishes_when_a
         return len(heard)
 
     for count in (1, 2):  # the second page is at the same port
+        for wrong in (Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_CLEANUP, 200):
+            assert not bench.ask(ChangeState, 'calibrator/change_state',
+                                 transition=Transition(id=wrong)).success
         bench.go(Transition.TRANSITION_CONFIGURE)
         viewer = Viewer(page_link(bench, process, count))
         bench.spin(lambda viewer=viewer: viewer.of('state') and viewer.state['calibration'])
         bench.spin(lambda: publisher.get_subscription_count() > 0)
         assert set_all() == [False] * 4
         assert pushes() == 0
+        assert 'but not activated, nothing is published' in bench.call('enable', data=True).message
         bench.go(Transition.TRANSITION_ACTIVATE)
         bench.spin(lambda viewer=viewer: pushes() > 0 and any(
             each['length'] for each in viewer.of('progress')))

@@ -11,11 +11,13 @@ the user states (parameter or option `sensor`). An unnamed one fits every sensor
 
 from collections.abc import Generator
 from dataclasses import replace
+import json
 from pathlib import Path
 
 from accel_calib.errors import AccelCalibError
 from accel_calib.session import enable, Mounting, run
-from inside import spread_directions
+from inside import spread_directions, use_calibration
+import numpy as np
 import pytest
 from shared import Readings, result, Stored
 from test_session import Driver
@@ -110,5 +112,12 @@ def test_mounting_is_published_in_the_frame_of_the_messages_and_not_under_the_pa
         stored: Stored) -> None:
     driver = Driver(sensor='arm', calibration_file=str(stored(sensor='arm', flat=[0, 0.6, 0.8])))
     driver.session.accepts('imu_link')
-    found = [event.frame_id for event in driver.session.events if isinstance(event, Mounting)]
-    assert found == ['imu_link']
+    found = [event[1:] for event in driver.session.events if isinstance(event, Mounting)]
+    assert found == [('imu_link', 'imu_link_levelled')]
+    driver.handle()
+    use_calibration(driver.session, None)  # a static transform cannot be removed
+    turned = next(event for event in driver.session.events if isinstance(event, Mounting))
+    assert turned.levelled == 'imu_link_levelled'
+    np.testing.assert_array_equal(turned.rotation, np.eye(3))
+    driver.handle()
+    assert json.loads(driver.results[-1])['in_use'] is False

@@ -258,5 +258,10 @@ def test_the_error_on_a_second_ramp_is_not_larger_than_that_of_the_autopilots(tr
 
 def test_a_session_with_the_offset_over_temperature_alone_says_so(tmp_path: Path) -> None:
     write_calibration(tmp_path / 'c.yaml', thermal(ramp(3)).calibration)
-    state = Driver(calibration_file=str(tmp_path / 'c.yaml')).session.state
+    driver = Driver(calibration_file=str(tmp_path / 'c.yaml'))
+    state, kept = driver.session.state, driver.calibration.model.values
     assert dict(figures(state))['state'] == 'correcting the offset over temperature alone'
+    driver.feed([0.1, 0.2, 9.8] + 0.01 * np.random.default_rng(1).normal(size=(100, 3)))
+    assert 'the offset over temperature is kept' in driver.ask('calibrate_at_rest')
+    assert driver.calibration.model.values.keys() == kept.keys()
+    assert driver.calibration.is_levelled

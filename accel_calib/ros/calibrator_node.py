@@ -18,6 +18,7 @@ EventsExecutor.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import partial, partialmethod
 from queue import SimpleQueue
 from time import monotonic
@@ -45,7 +46,6 @@ from ..errors import AccelCalibError
 from ..finding import LEVELS, NextStep
 from ..live import check_installed
 from ..logs import named_topics
-from ..messages import output_frame
 from ..session import (
     CalibratorSettings, CallSoon, Check, COMMANDS, conditions, diagnostics, enable, Event, figures,
     Log, Mounting, next_step, progress, Result, run, Session, ShowPoses, Still, Surroundings, Task,
@@ -251,7 +251,7 @@ class Calibrator:
     def _show(self, event: Event) -> None:
         if self._page is not None:
             self._page.exchange.show_event(event)
-        log, calibration = self._node.get_logger(), self.session.sensor.calibration
+        log = self._node.get_logger()
         match event:  # rclpy needs a separate line of code for each severity
             case Log('error', words):
                 log.error(words)
@@ -267,12 +267,9 @@ class Calibrator:
                 self._show_progress()
             case Result(text):
                 self._result.publish(String(data=text))
-            case Mounting(rotation, frame_id) if (
-                    self._mounting is not None and calibration is not None and frame_id):
-                settings = self.session.state.settings
+            case Mounting(rotation, frame_id, levelled) if self._mounting is not None:
                 self._mounting.publish(static_transform(
-                    self._node.get_clock().now().to_msg(), frame_id, output_frame(
-                        calibration, frame_id, settings.output_frame_id), rotation))
+                    self._node.get_clock().now().to_msg(), frame_id, levelled, rotation))
 
     def close(self) -> None:
         """Finish writing, and release the files."""
@@ -332,6 +329,8 @@ class ManagedCalibrator(LifecycleNode):
         super().__init__('calibrator')
         self._calibrator: Calibrator | None = None
         self._own = [*self.publishers, *self.subscriptions, *self.services, *self.timers]
+        service = self._service_change_state
+        self._change, service.callback = service.callback, self._on_change
         self._settings = CalibratorSettings()
         try:
             self._settings = declared(self, CalibratorSettings, fixed=False)
@@ -343,6 +342,13 @@ class ManagedCalibrator(LifecycleNode):
     def start(self) -> None:
         """Do nothing: transitions start the calibrator."""
 
+    def _on_change(self, request: Any, response: Any) -> Any:
+        """Change the state; a transition that this state has not would end rclpy (issue 1209)."""
+        with suppress(RuntimeError):  # rcl logs it
+            return self._change(request, response)
+        response.success = False
+        return response
+
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Read the parameters, load the calibration and listen, without publishing."""
         try:
@@ -351,7 +357,7 @@ class ManagedCalibrator(LifecycleNode):
             self.get_logger().error(str(error))
             self.on_cleanup(state)
             return TransitionCallbackReturn.FAILURE
-        self._calibrator.stream.set_active(active=False)
+        self._calibrator.session.change(is_active=False)
         self._calibrator.start()
         return TransitionCallbackReturn.SUCCESS
 
@@ -374,7 +380,7 @@ class ManagedCalibrator(LifecycleNode):
     def _set_active(self, state: LifecycleState, *, active: bool) -> TransitionCallbackReturn:
         """Publish corrected messages, or stop it."""
         if self._calibrator is not None:
-            self._calibrator.stream.set_active(active=active)
+            self._calibrator.session.change(is_active=active)
         return TransitionCallbackReturn.SUCCESS
 
     on_activate = partialmethod(_set_active, active=True)

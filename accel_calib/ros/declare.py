@@ -113,11 +113,10 @@ def name_of(endpoint: TopicEndpointInfo) -> str:
 
 
 def published_by_others(node: Node, types: Iterable[str]) -> list[tuple[str, ...]]:
-    """Return for each type, such as ``sensor_msgs/msg/Imu``, the topics of other nodes."""
-    own = node.get_namespace(), node.get_name()
-    graph = node.get_topic_names_and_types()
-    return [tuple(topic for topic, of_topic in graph if wanted in of_topic
-                  and any((each.node_namespace, each.node_name) != own
+    """Return for each type, such as ``sensor_msgs/msg/Imu``, the topics of no calibrator."""
+    graph = dict(node.get_topic_names_and_types())
+    return [tuple(topic for topic, of_topic in graph.items() if wanted in of_topic
+                  and any(f'{name_of(each)}/preview' not in graph
                           for each in node.get_publishers_info_by_topic(topic)))
             for wanted in types]
 

@@ -28,13 +28,17 @@ from std_srvs.srv import Trigger
 
 from .declare import declared, STREAM
 from ..effects import (
-    context_of_samples, model_with, parse_effect, predict, thermal_stream, turn_between)
+    context_of_samples, entry_of, model_with, parse_effect, predict, thermal_stream, turn_between)
+from ..errors import InputError
 from ..geometry import rotation_from_rpy, spread_directions
 from ..session import parameter
 from ..table import Floats, numbered, Recording
 from ..units import STANDARD_GRAVITY
 
 _FLAT = np.array([0.0, 0.0, 1.0])
+_KNOWN = frozenset({'time', 'temperature', 'rate', 'std'})
+"""Columns of the context that the simulator has."""
+
 _TEMPERATURE_EVERY = 0.1
 """Interval between temperature messages [s]."""
 
@@ -100,6 +104,11 @@ class SimulatedImu:
         self._model = model_with(
             dict(parse_effect(text) for text in settings.effects if text), rotation)
         self._thermal = thermal_stream(self._model)
+        without = [str(each) for each in self._model.effects
+                   if not _KNOWN.issuperset(entry_of(each).needs)]
+        if without:
+            raise InputError(f'the node does not simulate {" and ".join(without)}',
+                             'leave it out, or use accel-calib simulate')
         self._rng = np.random.default_rng(settings.seed)
         count, spread = settings.poses, spread_directions(settings.poses)
         if settings.mixed:  # in an order of which every part is spread over the sphere
@@ -152,15 +161,15 @@ class SimulatedImu:
         noise_g = settings.noise / settings.gravity
         known = {'time': time, 'temperature': first + (last - first) * (
             swing if settings.temperature_period else np.interp(time, [0.0, self.duration], [
-                0.0, 1.0]))}
+                0.0, 1.0])), 'rate': rate @ self._model.rotation.T}
         context = {**context_of_samples(known, len(path), self._model, self._thermal),
                    'std': np.full_like(force, noise_g)}
-        rng, rotation = self._rng, self._model.rotation
+        rng = self._rng
         columns = {
             **known, 'reference': force,
             'reading': predict(self._model, force, context) + rng.normal(
                 size=force.shape) * noise_g,
-            'rate': rate @ rotation.T + rng.normal(size=force.shape) * settings.gyro_noise}
+            'rate': known['rate'] + rng.normal(size=force.shape) * settings.gyro_noise}
         return Recording(columns, numbered(columns))
 
     def _append(self, up: Floats) -> None:

@@ -160,12 +160,6 @@ class Stream:
         self._due = self._arrived = 0.0
         self._listened = False
         self._state = session.state  # for which the outputs are prepared
-        self._active = True
-
-    def set_active(self, *, active: bool) -> None:
-        """Start or stop publishing."""
-        self._active = active
-        self._prepare()
 
     @property
     def newest(self) -> Triple | None:
@@ -222,7 +216,7 @@ class Stream:
                     thermal=sensor.temperatures.stream(turned.model))
             if output.rewriter is not None:
                 output.rewriter.bias = tuple(bias.tolist())
-        self._listened = self._active and any(output.listeners for output in self._outputs)
+        self._listened = state.is_active and any(output.listeners for output in self._outputs)
 
     def _adopt(self, data: bytes) -> bytes | None:
         """Return a message with a new layout as usual; None: not readable, or another sensor."""

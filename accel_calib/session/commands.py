@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from . import use
-from .conditions import next_words, way_of, words_of_state
+from .conditions import next_words, step_of, way_of, words_of_state
 from .poses import Guide
 from .state import Sensor, State
 from .store import writing_advice
@@ -29,9 +29,10 @@ from .worker import Compute, Files, nothing, Parse, Part, Task
 from ..calibration import (
     Calibration, fit_partial, gyro_bias_of_rest, level, mounting_only, set_heading as with_heading)
 from ..effects import Model
-from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
+from ..errors import (
+    AccelCalibError, InputError, RefusedFitError, StoredCalibrationError, TooFewPosesError)
 from ..findings import angle_words, difference_words
-from ..pipeline import is_partial
+from ..pipeline import is_partial, is_refined
 from ..stillness import Dwell, poses_from
 from ..text import counted, now
 
@@ -46,6 +47,10 @@ class ChangedError(AccelCalibError):
     """The calibration changed during a fit or a refinement."""
 
 
+class NoRestError(InputError):
+    """The sensor does not rest at this moment, so that the next step is the same."""
+
+
 def run(session: Holder, name: str, *, offers: bool = False) -> Task:
     """Run one of `BUTTONS`, and note why it is refused; `offers`: only offer what is new."""
     try:
@@ -55,7 +60,8 @@ def run(session: Holder, name: str, *, offers: bool = False) -> Task:
         if isinstance(found, Fitted):
             found = yield from _use(session, found, offers=offers)
     except AccelCalibError as error:
-        session.refuse(name, str(error))
+        if not isinstance(error, NoRestError):
+            session.refuse(name, str(error))
         raise
     return found
 
@@ -156,6 +162,10 @@ def _compute(session: Holder, function: Callable[..., Fitted], **given: Any) -> 
         count = len(sensor.live.poses())
         found = yield Compute(function, poses, units=state.units, sensor=state.name,
                               before=sensor.present, **given)
+    except TooFewPosesError as error:
+        session.refuse('poses', error.message)
+        advice = f'{_asked(session, error.advice)}{error.offer}'
+        raise RefusedFitError(error.message, advice) from None
     except RefusedFitError as error:
         session.refuse('poses', error.advice)
         raise
@@ -172,11 +182,18 @@ def _compute(session: Holder, function: Callable[..., Fitted], **given: Any) -> 
         why, advice = refusal
         is_asked = refinement is None and rating.next.kind == 'poses'  # the step names the pose
         session.refuse('poses', why if is_asked else advice)
+        advice = _asked(session, advice) if is_asked else advice
         if refinement is not None:
             rate(session, refinement)
         raise RefusedFitError(f'{found.words}; not used: {why}', advice)
     session.change_sensor(fitted_poses=count)
     return found
+
+
+def _asked(session: Holder, advice: str) -> str:
+    """Return the pose that the next step asks for; if it asks for none, the advice."""
+    step = step_of(session.sensor.guide, may_fit=False)
+    return step.text if step.direction else advice
 
 
 def _use(session: Holder, fitted: Fitted, *, offers: bool) -> Part[str]:
@@ -231,8 +248,10 @@ def calibrate_at_rest(session: Holder) -> Fitted:
     """Take mounting, gyro bias and the offset along gravity from the ongoing level rest."""
     state, rest = session.state, _rest(session.state)
     before = state.sensor.present
-    if before is not None and not is_partial(before):
-        found, words = before, 'offset and gain of the fit are kept'
+    if before is not None and (is_refined(before) or not is_partial(before)):
+        found, words = before, (
+            'the offset over temperature is kept, so that this rest corrects no offset'
+            if is_partial(before) else 'offset and gain of the fit are kept')
     else:
         found = fit_partial(poses_from([rest]), state.units, sensor=state.name, date=now())
         rotation = np.eye(3) if before is None else before.rotation
@@ -263,29 +282,32 @@ def _mount(state: State, calibration: Calibration, words: str, rest: Dwell | Non
 
 
 def _rest(state: State) -> Dwell:
-    """Return the ongoing rest; InputError if there is none, or no recent message."""
+    """Return the ongoing rest; NoRestError if there is none, or no recent message."""
     statistics, settings, live = state.statistics, state.settings, state.sensor.live
+    old = max(_OLD, 2.0 / statistics.rate if statistics.rate else 0.0)
+    if state.surroundings.ended:
+        raise NoRestError('the samples have ended', 'a rest can be used while they arrive')
     if not statistics.messages:
-        raise InputError('there is no Imu message yet', 'start the driver')
-    if statistics.age > _OLD:
-        raise InputError(f'the last Imu message arrived {statistics.age:.1f} s ago, expected '
-                         f'one within {_OLD:g} s', 'check the driver and try again')
-    if statistics.stopped > _OLD:
-        raise InputError(f'the stamps have not changed for {statistics.stopped:.1f} s '
-                         f'({statistics.stamp:.3f} s), expected the time of each reading',
-                         'set header.stamp in the driver')
+        raise NoRestError('there is no Imu message yet', 'start the driver')
+    if statistics.age > old:
+        raise NoRestError(f'the last Imu message arrived {statistics.age:.1f} s ago, expected '
+                          f'one within {old:g} s', 'check the driver and try again')
+    if statistics.stopped > old:
+        raise NoRestError(f'the stamps have not changed for {statistics.stopped:.1f} s '
+                          f'({statistics.stamp:.3f} s), expected the time of each reading',
+                          'set header.stamp in the driver')
     rest = live.detector.current()
     if rest is not None:
         return rest
     length = math.nan if state.units.is_native else statistics.length / state.units.per_g
     if abs(length - 1.0) > settings.still_norm_tolerance:
-        raise InputError(f'|a| is {length:.3g} g, expected about 1 g at rest',
-                         'hold the sensor still; if it is still, start again with the right units')
+        raise NoRestError(f'|a| is {length:.3g} g, expected about 1 g at rest', 'hold the sensor '
+                          'still; if it is still, start again with the right units')
     if not live.still:
-        raise InputError('the sensor is not still', f'hold it still for {settings.min_dwell:g} s, '
-                         'and check ~/still')
-    raise InputError(f'the sensor has been still for less than {settings.min_dwell:g} s',
-                     'hold it still for longer')
+        raise NoRestError('the sensor is not still', f'hold it still for {settings.min_dwell:g} '
+                          's, and check ~/still')
+    raise NoRestError(f'the sensor has been still for less than {settings.min_dwell:g} s',
+                      'hold it still for longer')
 
 
 # ----------------------------------------------------------------------------- files
@@ -299,6 +321,7 @@ def save(session: Holder) -> Task:
     yield Files(store.write, Parse(store.prepared, calibration))
     yield Files(store.save_poses, sensor.live.poses())
     if session.sensor.live is sensor.live:
+        session.change(not_stored='')
         session.change_sensor(unsaved=False)
         if session.sensor.offered is calibration:
             adopt(session, calibration, session.sensor.refinement, session.sensor.rating)
@@ -368,7 +391,7 @@ COMMANDS: dict[str, Callable[[Holder], Any]] = {each.__name__: each for each in 
 def enable(session: Holder, on: bool) -> str:
     """Switch the correction on or off."""
     session.change(enabled=on)
-    if session.state.files.problem:
+    if session.state.files.problem or not session.state.is_active:
         return f'the correction is {"on" if on else "off"}, but {words_of_state(session.state)}'
     if not on:
         return 'the correction is off: raw messages are published unchanged'

@@ -87,12 +87,17 @@ def conditions(state: State) -> list[Finding]:
         files.append(Finding(
             'read_only', f'{state.files.path} cannot be written: correct the permissions, or '
             f'{ANOTHER_FILE}', level='BAD'))
+    elif state.not_stored:
+        files.append(Finding('unsaved', state.not_stored, level='BAD'))
     blocks = bool(state.files.problem) or state.is_refused
     first, files = (files[:1], files[1:]) if blocks else ([], files)
     ended = state.surroundings.ended
     around = [] if ended else [*_check_stream(state), *_check_context(state)]
     if step.step == 'level' and ended:  # nothing can be levelled any more
         step = replace(step, step='done', text='use the calibration', command='')
+    elif step.step == 'poses' and ended:  # nor turned
+        step = _calling('fit', 'no more poses can come') if step.command == 'fit' else replace(
+            step, text=f'in another recording, {step.text}', direction=())
     if step.step not in _NEEDS_SAMPLES:
         found = [step, *files, *around, *of_use]
     elif step.step == 'done':
@@ -468,6 +473,9 @@ def diagnostics(state: State) -> list[Check]:
             'calibration': '' if sensor.calibration is None else title(sensor.calibration),
             'drift': 'no calibration yet' if drift is None else status(drift),
             'storage': state.files.path}
+    if drift is not None and not drift.count and (lacking := [
+            each.about for each in all_found if each.kind == 'no_value']):
+        fine['drift'] = f'not compared: the rests have no {" and no ".join(lacking)}'
     if sensor.calibration is None and sensor.offered is None:
         count = counted(len(sensor.live.poses()), 'pose')
         fine['calibration'] = f'no calibration yet, captured {count}'
@@ -489,8 +497,10 @@ def diagnostics(state: State) -> list[Check]:
 def words_of_state(state: State) -> str:
     """Return whether messages are corrected, and why not."""
     calibration = state.sensor.calibration
+    silent = '' if state.surroundings.publishers is None else ', nothing is published'
     return next(words for holds, words in (
-        (state.files.problem, 'another node uses the files, nothing is published'),
+        (state.files.problem, f'another node uses the files{silent}'),
+        (not state.is_active, 'not activated, nothing is published'),
         (not state.enabled, 'correction switched off, raw messages are published'),
         (state.sensor.offered is not None, 'a new calibration waits for ~/save or ~/undo'),
         (calibration is not None and not calibration.model.effects,
@@ -502,7 +512,7 @@ def words_of_state(state: State) -> str:
         (calibration is not None, 'correcting'),
         (not state.statistics.messages, 'waiting for the first message'),
         (state.settings.passthrough, 'no calibration, raw messages are published'),
-        (True, 'no calibration, nothing is published')) if holds)
+        (True, f'no calibration{silent}')) if holds)
 
 
 def figures(state: State) -> Iterator[tuple[str, str]]:

@@ -265,7 +265,7 @@ class Session(Holder):
         Returns whether no other node uses them.
 
         """
-        self.change(sensor=new_sensor(self.state.settings, self.state.units))
+        self.change(sensor=new_sensor(self.state.settings, self.state.units), not_stored='')
         self._find_store()
         files = self.state.files
         self.change(problem=files.problem)

@@ -319,6 +319,8 @@ class State:
         That of the messages; None before the first one.
     problem : str
         Why the stored calibration, or the files, cannot be used.
+    not_stored : str
+        Why the poses could not be stored.
     is_refused : bool
         Whether the stored calibration is sound, but not for this node as it was started.
     refusals : mapping of str to (str, tuple)
@@ -327,6 +329,8 @@ class State:
         What was found in the samples before they come here.
     enabled : bool
         Whether messages are corrected.
+    is_active : bool
+        Whether a managed node may publish them.
     still : bool
         Whether the sensor is still.
     still_since : float
@@ -349,10 +353,12 @@ class State:
     given: Floats | None = None
     frame_id: str | None = None
     problem: str = ''
+    not_stored: str = ''
     is_refused: bool = False
     refusals: Mapping[str, tuple[str, tuple[object, ...]]] = field(default_factory=dict)
     found: tuple[Finding, ...] = ()
     enabled: bool = True
+    is_active: bool = True
     still: bool = False
     still_since: float = math.nan
     surroundings: Surroundings = Surroundings()

@@ -34,6 +34,7 @@ from ..findings import (
     calibration_json, difference_words, mounting_figures, outlook, rate as rating_of, Rating,
     rating_json, refinement_json, short_verdict, verdict_words)
 from ..geometry import rotation_from_rpy, spread_directions
+from ..messages import output_frame
 from ..pipeline import calibrated, is_partial, is_refined, Plan
 from ..refinement import refine as refine_poses, Refinement
 from ..stillness import Dwell
@@ -46,6 +47,10 @@ _DIRECTIONS = 100
 
 _BEYOND = 100.0
 """Ratio to the typical size above which an effect is not caused by the sensor."""
+
+_NOTHING_IN_USE = json.dumps({'in_use': False, 'error': 'there is no calibration',
+                              'advice': 'capture poses and call ~/fit'})
+"""What ~/result has after ~/undo or ~/reset, so that nobody takes the last result for it."""
 
 _SEVERITY: dict[str, Severity] = {'GOOD': 'info', 'USABLE': 'warning', 'BAD': 'error'}
 """Severity of the log line about a finding, by its level."""
@@ -212,11 +217,12 @@ def adopt(session: Holder, calibration: Calibration | None, refinement: Refineme
           rating: Rating | None = None) -> None:
     """Correct with this calibration, and with the given mounting if there is one."""
     session.change(problem='', is_refused=False)
-    state, settings = session.state, session.state.settings
+    state, settings, before = session.state, session.state.settings, session.sensor.calibration
     if calibration is None:
         session.change(sensor=session.sensor.adopt(None))
         state.around.assume({})
         rate(session, None)
+        show_mounting(session, before)
         return
     levelled = calibration.is_levelled
     if levelled and calibration.frame != state.frame:
@@ -236,15 +242,24 @@ def adopt(session: Holder, calibration: Calibration | None, refinement: Refineme
                 f'{settings.frame if turned else "of the sensor"}')
     for finding in calibration.noted:
         session.log(_SEVERITY[finding.level], finding.words)
-    show_mounting(session)
+    show_mounting(session, before)
 
 
-def show_mounting(session: Holder) -> None:
-    """Show the mounting of the calibration in use, if it is levelled."""
-    calibration = session.sensor.calibration
-    if session.state.frame_id and calibration is not None and calibration.is_levelled:
-        levelled = on_topics(calibration, session.state.settings.frame)
-        session.events.append(Mounting(levelled.rotation, session.state.frame_id))
+def show_mounting(session: Holder, before: Calibration | None = None) -> None:
+    """
+    Show the mounting of the calibration in use, if it is levelled.
+
+    A static transform cannot be removed: that of a levelled calibration `before` becomes identity.
+
+    """
+    used, frame_id, settings = session.sensor.calibration, session.state.frame_id, (
+        session.state.settings)
+    shown = next((each for each in (used, before) if each is not None and each.is_levelled), None)
+    if frame_id and shown is not None:
+        turned = on_topics(shown, settings.frame)
+        session.events.append(Mounting(
+            turned.rotation if shown is used else np.eye(3), frame_id,
+            output_frame(turned, frame_id, settings.output_frame_id)))
 
 
 def rate(session: Holder, refinement: Refinement | None, rating: Rating | None = None) -> None:
@@ -253,8 +268,8 @@ def rate(session: Holder, refinement: Refinement | None, rating: Rating | None =
     session.change_sensor(refinement=refinement)
     if rating is not None or calibration is None:
         session.change_sensor(rating=rating)
-    if calibration is not None:
-        session.events.append(_report_rating(session, calibration, refinement, rating))
+    session.events.append(Result(_NOTHING_IN_USE) if calibration is None else _report_rating(
+        session, calibration, refinement, rating))
 
 
 def _report_rating(session: Holder, calibration: Calibration, refinement: Refinement | None,
@@ -301,9 +316,11 @@ def _draw_poses(session: Holder, sensor: Sensor, poses: Poses, *, added: int,
     given = poses, state.units, state.settings.model, guide.skipped
     try:
         yield Files(nothing) if store is None else Files(store.save_poses, poses)
+        if store is not None:
+            session.change(not_stored='')
     except OSError as error:
-        session.log('error', f'the poses could not be stored: {error}; {writing_advice(error)}',
-                    'not_stored', AGAIN)
+        session.change(not_stored=f'the poses could not be stored: {error}; '
+                                  f'{writing_advice(error)}')
     # Computed even where only an average has changed, so that the lines keep their order.
     plan = yield Compute(plan_session, *given) if due and len(poses) else Compute(nothing)
     if due and not len(poses):  # without the start of the worker process

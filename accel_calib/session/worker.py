@@ -286,10 +286,11 @@ class ShowPoses(NamedTuple):
 
 
 class Mounting(NamedTuple):
-    """The mounting in use: ΔR, (3, 3), and the frame of the sensor."""
+    """The mounting in use: ΔR, (3, 3), the frame of the sensor, and the levelled frame."""
 
     rotation: Floats
     frame_id: str
+    levelled: str
 
 
 class Result(NamedTuple):
