@@ -68,6 +68,7 @@ KINDS: Mapping[str, str] = MappingProxyType({
     'clock': 'the order or the times of the rows are not those of the samples',
     'columns': 'what columns hold is decided by their values',
     'not_used': 'a column is not used, because of its cells or its values',
+    'coarse': 'the steps of the thermometer leave a part of the residual',
     'copies': 'equal rows count as one pose',
     'unlike_fleet': 'the sensor is unlike the fleet',
     'unnamed': 'recordings of a fleet do not say of which sensor they are',
@@ -96,6 +97,9 @@ KINDS: Mapping[str, str] = MappingProxyType({
     'step': 'the next step of a calibration that is not done',
     'note': 'a note'})
 """Kinds of findings and their meaning, the most informative reason for a rating first."""
+
+CAUSES = ('not_used', 'coarse')
+"""Kinds that may be the cause of a residual that no effect explains."""
 
 STEPS: Mapping[str, str] = MappingProxyType({
     'connect': 'no samples arrive: check the driver, its topic and the cable',

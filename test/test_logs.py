@@ -192,7 +192,10 @@ def test_a_column_with_holes_is_the_next_step_where_no_effect_explains(
     rows[7][3] = hole
     path = write(tmp_path, text_of(rows, f'ax,ay,az,{column},std_x,std_y,std_z,count'))
     _, made = run_json(capsys, 'refine', path)
-    assert made['next']['text'].startswith(f'fill in the cells of {column}')
+    cause = made['next']['text']
+    assert cause.startswith(f'fill in the cells of {column}')
+    about_the_gap = [line for line in made['advice'] if 'gap' in line or 'repeat' in line]
+    assert [cause in line for line in about_the_gap] == [True]
 
 
 @pytest.mark.parametrize(('number', 'apart'), [(2, 3e-3), (2, 0.0), (3, 1e-3)])

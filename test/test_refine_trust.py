@@ -96,6 +96,22 @@ def test_structure_that_is_not_understood_remains_a_gap(structure):
     assert ['gap' in kinds[0], 'scatter' in kinds[0], 'scatter' in kinds[1]] == [True, False, True]
 
 
+@pytest.mark.parametrize('seed', [1, 4])
+def test_the_steps_of_a_thermometer_are_named_and_no_walk_or_curve_instead(seed):
+    rng, time = np.random.default_rng(seed), 30.0 * np.arange(60)
+    warm = 25.0 + 3.0 * np.sin(4.0 * np.pi * time / time[-1]) + 0.1 * rng.normal(size=60)
+    effects = {'offset': OFFSET, 'offset_temperature': [0.016, -0.011, 0.0064]}
+    found = refine(simulate_poses(model_with(effects), random_directions(60, rng), rng, context={
+        'time': time, 'temperature': warm}, noise_g=0.003).with_columns(
+            temperature=np.round(warm)), G)
+    assert not {'offset_wander', 'empirical'}.intersection(step.effect for step in found.steps)
+    assert found.verdict == 'unexplained'
+    cause, = (each for each in found.calibration.noted if each.kind == 'coarse')
+    assert 'steps of 1 °C' in cause.text
+    assert any(cause.advice in line for line in found.advice)
+    assert not any('clamp' in line for line in found.advice)
+
+
 def test_poses_that_scatter_alike_hide_nothing_though_their_noise_differs():
     found = [ac.refine(table([6, seed], {'repeatability': 5.0}, shaking=30.0), base='10')
              for seed in range(4)]

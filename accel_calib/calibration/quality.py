@@ -249,7 +249,7 @@ _SMALL_CHI2 = 1e-9
 
 
 OF_A_FIT = ('no_check', 'not_covered', 'noise_not_known', 'beyond_noise', 'below_noise',
-            'hardly_checked', 'outlier_not_certain')
+            'hardly_checked', 'outlier_not_certain', 'coarse')
 """Kinds of findings about one fit, which do not hold for another fit."""
 
 

@@ -51,4 +51,5 @@ from .records import (
     formula_of, kind_of, modes_of, shown_name, unchanged, unit_of, value_unit, variable_of,
     variable_words, VARIABLES)
 from .simulate import model_with, parse_effect, simulate_poses, simulate_recording, turn_between
-from .thermal import acting_temperature, between_steps, covariance_of_steps, rate_at, ThermalStream
+from .thermal import (
+    acting_temperature, between_steps, covariance_of_steps, rate_at, step_of, ThermalStream)

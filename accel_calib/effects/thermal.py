@@ -159,6 +159,13 @@ def between_steps(time: Floats, temperature: Floats) -> Floats:
     return estimated
 
 
+def step_of(columns: Mapping[str, Any]) -> float:
+    """Return the step of the temperatures of poses [°C]; 0 if they are not in steps."""
+    found = _steps_of(columns['time'], columns['temperature']) if (
+        {'time', 'temperature'} <= columns.keys()) else None
+    return 0.0 if found is None else found.step
+
+
 def covariance_of_steps(time: Floats, temperature: Floats, onto: Floats) -> Floats:
     """
     Return the (p, p) covariance that the errors of `between_steps` cause, 0 without steps.

@@ -27,7 +27,7 @@ from ..calibration import (
 from ..comparison import Comparison, LEVEL
 from ..effects import EmpiricalCurve, entry_of, WANDER
 from ..errors import TAKE_ALL_SIDES
-from ..finding import Finding, NextStep, rated, Rating, without
+from ..finding import CAUSES, Finding, NextStep, rated, Rating, without
 from ..geometry import coverage, distinct
 from ..table import is_quantity, Poses, range_of
 from ..text import counted, listed
@@ -250,8 +250,8 @@ def _remedy(expected: Expected, refinement: Refinement | None) -> dict[str, Any]
 
 
 def _advise(expected: Expected, otherwise: str) -> str:
-    """Return the advice on a column that is not used, which may be the cause, or another one."""
-    return next((each.advice for each in expected.calibration.noted if each.kind == 'not_used'),
+    """Return the advice on a column that may be the cause, or another one."""
+    return next((each.advice for each in expected.calibration.noted if each.kind in CAUSES),
                 otherwise)
 
 

@@ -240,8 +240,7 @@ def _curve_words(figures: Mapping[str, Any]) -> str:
         low, high = figures['between']
         words += f', most between {low:.4g} and {high:.4g} {unit_of(variable)}'.rstrip()
     nearest = [f'{effect} (leaves {left:.2g} mg)' for effect, left in figures['nearest'].items()]
-    return words + (f'; no known effect has this form, the nearest are {", ".join(nearest)}'
-                    if nearest else '')
+    return words + (f'; the nearest known effects are {", ".join(nearest)}' if nearest else '')
 
 
 _PLACES: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
@@ -304,9 +303,11 @@ _REMARKS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     'few': lambda of: (
         f'{counted(of["poses"], "pose")} leave {counted(of["dof"], "degree")} of freedom, which '
         'is too few to detect most effects: take 24 poses or more'),
+    'cause': lambda of: f'the gap may have this cause: {of["advice"]}',
     'scatter': lambda of: (
-        f'poses repeat {of["ratio"]:.1f} times worse than their samples, and the scatter has no '
-        'structure: clamp the sensor, let it settle longer, or check the unit of std, and count'),
+        f'poses repeat {of["ratio"]:.1f} times worse than their samples, and no effect describes '
+        'how: clamp the sensor, let it settle longer, check the unit of std, and count, or record '
+        'what else differs between the poses'),
     'record': lambda of: (
         f'record {"; ".join(of["columns"])}: their effects cannot be tested yet'),
     'not_searched': lambda of: (

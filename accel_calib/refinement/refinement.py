@@ -18,7 +18,7 @@ are listed as not testable.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
@@ -27,7 +27,7 @@ from importlib import import_module
 import numpy as np
 
 from .search import beside_stored, Found, join, sampled, search, with_changes
-from .state import fitted_state, is_noise, State
+from .state import fitted_state, is_noise, slope_of_temperature, State
 from .steps import (
     find_rivals, not_testable, Remark, remarks_on, Stage, Step, steps_of, untestable, Verdict,
     verdict_of)
@@ -37,15 +37,16 @@ from ..calibration import (
     quality_of, record_of, refuse_if_unfit, Rejected, rejected_by, sound_rows, sure_rows,
     uncertainty_g, with_rest_noise)
 from ..effects import (
-    add_history, covariance_of_steps, EffectKey, Model, MODELS, OwnEffect, PROCESSES, unchanged,
-    with_vector)
+    add_history, covariance_of_steps, EffectKey, Model, MODELS, OwnEffect, PROCESSES, step_of,
+    unchanged, with_vector)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import fit_sphere, judge, NotConvergedError, originals, outliers, variance_factor
-from ..finding import explained_by, Finding, without as without_kinds
+from ..finding import CAUSES, explained_by, Finding, without as without_kinds
 from ..geometry import unit
+from ..statistics import rms
 from ..table import check_units, Floats, Poses, Record
 from ..text import counted, table
-from ..units import BASES, Units
+from ..units import BASES, MG, Units
 
 _LEAST_POSES = 4
 """Smallest number of poses in which an effect can be found."""
@@ -63,8 +64,8 @@ _LEAST_CHECKS = 4
 """Smallest number of equations beyond values with which a refinement is used. With fewer, of 12
 simulated poses, a wrong effect explains as much as the true one, and new poses read worse."""
 
-_WARMER = 1e-3
-"""Difference of temperature for the slope of a reading [°C]."""
+_OF_GAP = 0.5
+"""Smallest part of the squares of a gap that the steps of a thermometer leave if they cause it."""
 
 _BASE = '10'
 _ORIENTATION = ('reference', 'orientation')
@@ -226,14 +227,14 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
         return known if stored is None else beside_stored(known, stored, model)
 
     every, model = at(calibration.model), Model(calibration.model.values)
-    total, poses_g = len(every), sampled(every)
+    total, poses_g, step = len(every), sampled(every), step_of(sound.columns)
     try:
-        found = search(poses_g, model, also)
+        found = search(poses_g, model, also, step)
         for _ in range(_SEARCHES if 'previous' in found.final.model.needs else 0):
             before, poses_g = poses_g, _along_ways(found.final, at)
             if _is_same_way(found.final.model, before, poses_g):
                 break
-            found = search(poses_g, model, also)
+            found = search(poses_g, model, also, step)
     except NotConvergedError:
         raise RefusedFitError(f'the base {calibration.name} cannot be fitted to these poses, '
                               'expected a fit that converges', 'check the poses for mistakes, or '
@@ -248,7 +249,7 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
                      'disturbed poses among the others; choose rows to use others')
     note = (*(poses.findings if stored else ()), *((sample,) if len(poses_g) < total else ()))
     given = Given(poses, poses_g, stored=stored is not None, rejected=(*rejected, *unsound),
-                  notes=note)
+                  notes=(*note, *_coarse(found.final, step)))
     return _conclude(calibration, found, given)
 
 
@@ -285,13 +286,10 @@ def _with_steps(final: State, poses: Poses) -> State:
     orientation, this is without the part that a turn of all of them explains.
 
     """
-    fit, model = final.fit.beside or final.fit, final.model
-    if not {'time', 'temperature'} <= {*poses.columns} or 'temperature' not in model.over:
+    fit = final.fit.beside or final.fit
+    if not {'time', 'temperature'} <= {*poses.columns} or 'temperature' not in final.model.over:
         return final
-    context, near = fit.context, fit.equations
-    warmer = {**context, 'temperature': context['temperature'] + _WARMER}
-    slope = np.nan_to_num(model.at(warmer).reading(near.force)
-                          - model.at(context).reading(near.force)) / _WARMER
+    near, slope = fit.equations, slope_of_temperature(fit)
     rows = np.sum(near.columns(Model({'offset': np.zeros(3)})) * slope[near.pose], axis=1)
     onto, order = np.zeros((len(poses), fit.columns.shape[1])), np.argsort(poses.row)
     place = np.searchsorted(poses.row, fit.poses_g.row[near.pose], sorter=order)
@@ -300,6 +298,17 @@ def _with_steps(final: State, poses: Poses) -> State:
               (fit.columns @ fit.by_pose.spread * rows[:, np.newaxis])[own])
     spread = covariance_of_steps(poses['time'], poses['temperature'], onto.T)
     return State(replace(final.fit, of_context=fit.ties @ spread @ fit.ties.T))
+
+
+def _coarse(final: State, step: float) -> Iterator[Finding]:
+    """Yield a finding if the steps of the thermometer [°C] may be the cause of a gap."""
+    change = np.sum(slope_of_temperature(final.fit) * final.fit.equations.force, axis=1)
+    left_mg = rms(change) * step / np.sqrt(12.0) * MG
+    gap_mg, floor_mg = final.gap_mg(final.residual), final.floor_mg or 0.0
+    if not final.is_noise and left_mg ** 2 > _OF_GAP * (gap_mg ** 2 - floor_mg ** 2):
+        yield Finding('coarse', f'the temperature is stated in steps of {step:.2g} °C, in which '
+                      f'the readings change by {left_mg:.2g} mg (RMS)',
+                      'record the temperature in finer steps')
 
 
 def _conclude(calibration: Calibration, found: Found, given: Given) -> Refinement:
@@ -329,7 +338,9 @@ def _conclude(calibration: Calibration, found: Found, given: Given) -> Refinemen
     if refusal:
         steps = tuple(replace(step, parameters_sd={}) for step in steps)
     verdict, undecided = verdict_of(found, steps, refused=bool(refusal))
-    remarks = remarks_on(found, steps, missing, len(outliers),
+    cause = next((each.advice for each in (*given.poses.findings, *given.notes)
+                  if each.kind in CAUSES), '')
+    remarks = remarks_on(found, steps, missing, len(outliers), cause=cause,
                          unexplained=verdict == 'unexplained' and not undecided)
     fitted = _record_of(refined, final, missing, remarks)
     return replace(

@@ -52,7 +52,8 @@ from .curves import (
 from .linear import LEVEL, Set
 from .settle import fit_without, make_sound, Near, settle
 from .state import (
-    beginning, Candidate, Clipped, fitted_state, linearised, off_grid, State, unclipped, without)
+    beginning, Candidate, Clipped, fitted_state, linearised, off_grid, slope_of_temperature, State,
+    unclipped, without)
 from ..calibration import Calibration, in_g
 from ..effects import (
     add_history, CHANGES, Covariate, COVARIATES, EffectKey, EFFECTS, entry_of, factors_of,
@@ -227,11 +228,13 @@ class Found:
         return one_curve(self.final)
 
 
-def search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...] = ()) -> Found:
+def search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...] = (), step: float = 0.0
+           ) -> Found:
     """
     Search for the effects that a base lacks; `NotConvergedError` if its fit fails.
 
-    `also` are own effects of the user, which are tried beside the catalogue.
+    `also` are own effects of the user, which are tried beside the catalogue, and `step` is that of
+    the thermometer [°C].
 
     """
     everyone = np.arange(len(poses_g))
@@ -243,6 +246,13 @@ def search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...] = ()) -> Fou
     found = _search(poses_g, base, also)
     again = _with_own_noise if 'new' in poses_g else _with_scatter
     found = again(found, poses_g, base, also)
+    fit, noise = judge(found.final.model, poses_g), poses_g.noise
+    change = step / np.sqrt(12.0) * np.abs(slope_of_temperature(fit))
+    if noise is not None and np.any(change) and not found.final.is_noise:
+        # A walk, a curve or an effect could describe what the steps leave, alike in neighbours.
+        share = (found.final.rss / found.final.dof - 1.0) / float(np.mean((change / noise) ** 2))
+        scatter = change * np.sqrt(min(share, 1.0))
+        found = _beside(poses_g.with_columns(own_scatter=scatter), base, also)
     return replace(found, base=_weighted(found.base), final=_weighted(found.final),
                    outliers=everyone[found.outliers], clipped=clip, grid_g=grid,
                    with_clipped=whole, also=also)

@@ -110,6 +110,9 @@ _LEAST_OF_GRID = 0.25
 _RELEVANT = 0.25
 """Smallest part of the variance of a mean that a relevant grid causes."""
 
+_WARMER = 1e-3
+"""Step of the derivative by the temperature [°C]."""
+
 _IDEAL = Model({})
 
 
@@ -339,6 +342,16 @@ class State:
     def floor_mg(self) -> float | None:
         """Return the residual expected of a correct model [mg]; None if the noise is unknown."""
         return rms(self._of_new(self.fit.noise_g)) * MG if self.fit.noise_known else None
+
+
+def slope_of_temperature(fit: Fit) -> Floats:
+    """Return the (n, 3) change of the readings of poses with the temperature [g/°C]."""
+    context, force = fit.context, fit.equations.force
+    if 'temperature' not in fit.model.over:
+        return np.zeros(force.shape)
+    warmer = {**context, 'temperature': context['temperature'] + _WARMER}
+    return np.nan_to_num(fit.model.at(warmer).reading(force)
+                         - fit.model.at(context).reading(force)) / _WARMER
 
 
 def is_noise(rss: float, dof: float) -> bool:

@@ -391,12 +391,13 @@ def named_entries(also: tuple[OwnEffect, ...]) -> dict[str, Effect]:
 
 
 def remarks_on(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[str, str], ...],
-               left_out: int, *, unexplained: bool = False) -> tuple[Remark, ...]:
+               left_out: int, *, unexplained: bool = False, cause: str = '') -> tuple[Remark, ...]:
     """
     Return remarks for advice.
 
     `untestable` are the effects that the data cannot show, and the data to record for them;
-    `left_out` is the number of poses that were left out; `unexplained`: a gap remains.
+    `left_out` is the number of poses that were left out; `unexplained`: a gap remains, and `cause`
+    is the advice on a probable one, if any.
 
     """
     poses_g, remarks = found.base.poses_g, list[Remark]()
@@ -412,7 +413,9 @@ def remarks_on(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[st
         remarks.append(Remark('left_out', {'poses': left_out}))
     if found.base.dof < _FEW:
         remarks.append(Remark('few', {'poses': len(poses_g), 'dof': found.base.dof}))
-    if unexplained and not found.taken_back and found.curve is None and WANDER not in found.added:
+    if unexplained and cause:
+        remarks.append(Remark('cause', {'advice': cause}))
+    elif unexplained and not (found.taken_back or found.curve or WANDER in found.added):
         ratio = float(np.sqrt(found.final.rss / found.final.dof))
         remarks.append(Remark('scatter', {'ratio': ratio}))
     elif unexplained:
