@@ -128,6 +128,11 @@ class LogOptions:
     in_child: bool = True
     partial: bool = False
 
+    def __post_init__(self) -> None:
+        for name in ('columns', 'context'):
+            if not isinstance(given := getattr(self, name), Mapping):
+                raise ValueError(f'{name} is {given!r}, expected a mapping by column')
+
     @property
     def instance(self) -> str:
         """Return `sensor`, of a flight log: ``1.0``, as programs write a number, is 1."""
