@@ -288,8 +288,9 @@ def test_a_field_is_read_only_if_one_can_hold_the_column(
 def test_the_layout_of_an_array_is_no_quantity(tmp_path: Path) -> None:
     types, kind = STORE.types, 'std_msgs/msg/Float64MultiArray'
     array = types[kind](types['std_msgs/msg/MultiArrayLayout']([], 7), np.array([20.0, 21.0]))
+    topics = [('/imu', IMU), ('/temperature', TEMPERATURE), ('/words', STRING), ('/arr', kind)]
     made = [*few_messages(), *((3, START + RATE_NS * k, array) for k in range(0, FEW, 5))]
-    path = MAKES['mcap folder'](tmp_path, [*TOPICS, ('/arr', kind)], made)
+    path = MAKES['mcap folder'](tmp_path, topics, made)
     options = LogOptions(context={'warmth': '/arr'})
     with pytest.raises(InputError, match='has no single number, expected one warmth'), open_log(
             path, options):

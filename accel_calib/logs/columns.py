@@ -411,8 +411,8 @@ def _sources(layout: TextLayout, given: Mapping[str, str]) -> dict[str, int]:
     # What is not asked for, and holds other text than numbers, does not stand in the way.
     return {ours: k for ours, k in found.items() if given.get(ours, ours) and (
         ours not in (*RATE, *CONTEXT) or ours in given or layout.name(k) == ours
-        or _are_numbers([cell for cell in layout.first(k)[:_FIRST_ROWS] if not (
-            ours in CONTEXT and cell.casefold() in EMPTY)]))}
+        or _are_numbers(layout.first(k)[:_FIRST_ROWS] if ours in RATE else [
+            cell for cell in layout.first(k) if cell.casefold() not in EMPTY] or ['']))}
 
 
 def column(layout: TextLayout, theirs: str) -> int:
