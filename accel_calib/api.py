@@ -441,6 +441,8 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
     for name, value, least, most in (
             ('poses', poses, 1, _MOST_ROWS), ('samples', samples, 1, _MOST_ROWS),
             ('noise', noise, 0, LARGEST), ('seed', seed, 0, math.inf),
+            ('rate', rate, 1e-9, LARGEST), ('dwell', dwell, 0, LARGEST),
+            ('turn', turn, 0, LARGEST),
             ('poses * (dwell + turn) * rate', rows, 0, _MOST_ROWS)):
         if not least <= value <= most:
             raise InputError(f'{name} is {str(value)[:40]}, expected {least:g} to '
@@ -498,7 +500,7 @@ def _asked(given: Source | Poses | Recording | Data, units: UnitName | None,
     elif hasattr(given, 'columns') and not isinstance(given, Table):
         source = Frame(given)
     elif not isinstance(given, Table):
-        columns = {'reading': np.asarray(given, float)}
+        columns = {'reading': np.ma.asarray(given, float).filled(np.nan)}
         shape = columns['reading'].shape
         if len(shape) != 2 or shape[1] != 3:
             raise InputError(f'the array has shape {shape}, expected (n, 3) readings',

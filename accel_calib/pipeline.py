@@ -474,6 +474,8 @@ def thermally_calibrated(logs: Sequence[Intake], plan: Plan = Plan()) -> Thermal
 
 def _row(poses: Poses, flat: Flat) -> int | None:
     if isinstance(flat, str):
+        if flat not in ('first', 'last'):
+            raise ValueError(f'flat is {flat!r}, expected a row number, first or last')
         return int(poses.row[0 if flat == 'first' else -1])
     return flat
 

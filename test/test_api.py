@@ -110,6 +110,23 @@ def test_samples_without_times_are_refused(recording):
     assert len(ac.capture(frame, rate=100.0)) == 6
 
 
+def test_what_python_passes_is_used_as_it_is_or_named():
+    pandas = pytest.importorskip('pandas')
+    reading = ac.simulate(SENSOR, poses=20).reading
+    hidden = np.ma.masked_array(reading, mask=np.arange(60).reshape(20, 3) == 4)
+    with pytest.raises(InputError, match='row 2 of ax, ay, az holds a number that is not finite'):
+        ac.fit(hidden)
+    unnamed = ac.fit(pandas.DataFrame(reading))
+    assert (len(unnamed.poses), unnamed.rejected) == (20, ())
+    with pytest.raises(ValueError, match="flat is 'middle', expected a row number, first or last"):
+        ac.calibrate(reading, flat='middle')
+    with pytest.raises(ValueError, match='context is .*, expected a mapping by column'):
+        ac.capture('bag', context=['temperature:=/imu/temp'])
+    for name in ('rate', 'turn'):
+        with pytest.raises(InputError, match=f'{name} is -1, expected'):
+            ac.simulate(recording=True, **{name: -1})
+
+
 def test_a_log_is_calibrated_in_one_call(tmp_path):
     recording = ac.simulate(SENSOR, recording=True, poses=20, seed=3)
     path = tmp_path / 'log.csv'

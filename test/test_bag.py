@@ -24,8 +24,8 @@ from accel_calib.stillness import capture
 from accel_calib.stored import write_calibration
 from accel_calib.table import Recording
 from bag_files import (
-    COUNT as FEW, header, IMU, imu, MAKES, McapFile, RATE_NS, ros1, rosbag2, START, STORE, STRING,
-    TEMPERATURE, write_bag)
+    COUNT as FEW, header, IMU, imu, MAKES, McapFile, messages as few_messages, RATE_NS, ros1,
+    rosbag2, START, STORE, STRING, TEMPERATURE, write_bag)
 from faults.fuzz import ended, read_bag
 from inside import (
     BLOCK_OF_A_BAG, read_log, rotation_from_rpy, ROWS_OF_A_BAG, simulate_recording,
@@ -283,6 +283,18 @@ WARM = LogOptions(context={'temperature': '/imu/temp'})
 def test_a_field_is_read_only_if_one_can_hold_the_column(
         column: str, numbers: tuple[str, ...], asked: str, field: str) -> None:
     assert field_of(column, numbers, asked) == field
+
+
+def test_the_layout_of_an_array_is_no_quantity(tmp_path: Path) -> None:
+    types, kind = STORE.types, 'std_msgs/msg/Float64MultiArray'
+    array = types[kind](types['std_msgs/msg/MultiArrayLayout']([], 7), np.array([20.0, 21.0]))
+    topics = [('/imu', IMU), ('/temperature', TEMPERATURE), ('/words', STRING), ('/arr', kind)]
+    made = [*few_messages(), *((3, START + RATE_NS * k, array) for k in range(0, FEW, 5))]
+    path = MAKES['mcap folder'](tmp_path, topics, made)
+    options = LogOptions(context={'warmth': '/arr'})
+    with pytest.raises(InputError, match='has no single number, expected one warmth'), open_log(
+            path, options):
+        pass
 
 
 def test_a_bag_is_corrected_with_a_named_temperature(tmp_path: Path) -> None:

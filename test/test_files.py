@@ -23,15 +23,15 @@ from accel_calib.effects import OwnEffect
 from accel_calib.errors import (
     AccelCalibError, DamagedCalibrationError, InputError, StoredCalibrationError)
 from accel_calib.finding import has
-from accel_calib.logs import open_log, read_poses, write_table
-from accel_calib.pipeline import Correction
+from accel_calib.logs import read_poses, write_table
 from accel_calib.stored import read_calibration, read_prior, write_calibration
 from accel_calib.table import COLUMNS, numbered, Poses
 from faults.fuzz import LONGEST_LINE
 from faults.inputs import intact
 from inside import (
-    format_calibration, Model, MOST_BYTES, MOST_BYTES_READ, MOST_LETTERS_OF_LABELS, MOST_VALUES,
-    MOST_VALUES_READ, parse_calibration, previous, read_plain, simulate_poses, spread_directions)
+    format_calibration, main, Model, MOST_BYTES, MOST_BYTES_READ, MOST_LETTERS_OF_LABELS,
+    MOST_VALUES, MOST_VALUES_READ, parse_calibration, previous, read_plain, simulate_poses,
+    spread_directions)
 import numpy as np
 import pytest
 from shared import G, sensor, table, with_effects
@@ -345,7 +345,8 @@ def test_a_number_is_read_as_yaml_reads_it() -> None:
 
 @pytest.mark.parametrize('name', ['temperature', 'Temp (°C)'])
 @pytest.mark.parametrize('empty', ['', 'nan', 'N/A'])
-def test_the_temperature_of_a_slower_thermometer_is_known_at_each_sample(name, empty, tmp_path):
+def test_the_temperature_of_a_slower_thermometer_is_known_at_each_sample(
+        name, empty, tmp_path, capsys):
     made = ac.simulate({'offset_temperature': 0.002}, recording=True, poses=24, seed=8,
                        temperature=(18.0, 40.0))
     warm = [f'{each:.3f}' if k % 97 == 3 else empty
@@ -360,6 +361,7 @@ def test_the_temperature_of_a_slower_thermometer_is_known_at_each_sample(name, e
     calibration = ac.calibrate(log)
     assert 'offset_temperature' in calibration.model.effects
     calibration.save(tmp_path / 'c.yaml')
-    log.write_text('time,ax,ay,az,temperature\n0,0,0,9.8,\n0.01,0,0,9.8,\n0.02,0,0,9.8,\n')
-    with pytest.raises(InputError, match='need temperature'), open_log(log) as without:
-        [*map(Correction(calibration, without.units, ''), without.blocks)]
+    log.write_text('time,ax,ay,az,temperature\n' + ''.join(
+        f'{k / 100},0,0,9.8,\n' for k in range(40)))
+    done = main(['apply', str(log), '-c', str(tmp_path / 'c.yaml'), '-o', str(tmp_path / 'out')])
+    assert (done, 'need temperature' in capsys.readouterr().err) == (2, True)

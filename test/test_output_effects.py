@@ -3,6 +3,7 @@
 
 """Recordings that are clipped or coarsely quantised: their poses, their noise, and the names."""
 
+import accel_calib as ac
 from accel_calib.calibration import fit_poses, in_g
 from accel_calib.logs import read_recording
 from accel_calib.stillness import capture
@@ -131,3 +132,11 @@ def test_the_coarsest_grid_that_holds_the_means_is_that_of_a_table_without_noise
     reading = 2e-3 * np.cumsum(steps, axis=0)
     expected = 2e-3 if isinstance(apart, tuple) else 2e-3 * apart
     assert grid_step(poses_of(reading)) == pytest.approx(expected)
+
+
+def test_the_samples_of_a_simulated_sensor_end_at_its_limit_and_lie_on_its_grid():
+    for effect, value in (('saturation', 0.9), ('quantisation', 0.004)):
+        made = ac.simulate({effect: value}, recording=True, poses=8, units='g').reading
+        steps = made / 0.004
+        assert (np.max(np.abs(made)) == 0.9) == (effect == 'saturation')
+        assert (np.max(np.abs(steps - np.round(steps))) < 1e-9) == (effect == 'quantisation')

@@ -174,9 +174,9 @@ def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str | Verdict]:
     """Yield a line for each of several results."""
     for result in results:
         if 'error' in result:
-            yield f'{result["file"]} {result["error"]}; {result["advice"]}'
+            yield f'{result["file"]}: {result["error"]}; {result["advice"]}'
             continue
-        line = (f'{result["file"]} model {result["model"]}: {result["rms_before_mg"]:.3g} -> '
+        line = (f'{result["file"]}: model {result["model"]}: {result["rms_before_mg"]:.3g} -> '
                 f'{result["rms_after_mg"]:.3g} mg, ')
         yield Verdict(f'{line}{result["rating"]}', result['rating'], len(line))
 

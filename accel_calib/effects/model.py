@@ -533,15 +533,16 @@ def linear_model(name: str, mat_w: Floats, vec_v: Floats) -> Model:
     return Model({effect: values[effect] for effect in MODELS[name].effects})
 
 
-def predict(model: Model, force: Floats, context: Context) -> Floats:
+def predict(model: Model, force: Floats, context: Context, noise: Floats | float = 0.0) -> Floats:
     """
     Return the (n, 3) readings of a sensor [g].
 
     `force` is the (n, 3) specific force in the levelled frame [g]. `context` has the columns that
-    the effects need, n rows each. Raise `InputError` if a column is missing.
+    the effects need, n rows each. The `noise` [g] is that before the output. Raise `InputError` if
+    a column is missing.
 
     """
-    reading = model.at(context).reading(force @ model.rotation.T)
+    reading = model.at(context).reading(force @ model.rotation.T) + noise
     for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
         if effect.output is not None:
             reading = effect.output(reading, values)

@@ -160,7 +160,7 @@ def simulate_recording(model: Model, directions: Floats, rng: np.random.Generato
     known = {'std': np.full((count, 3), noise_g), 'previous': way[place], **columns,
              'rate': rate @ model.rotation.T,
              'since_turn': columns['time'] - columns['time'][np.searchsorted(place, place)]}
-    reading = predict(model, force, add_turns(known))
-    columns['reading'] = reading + rng.normal(size=(count, 3)) * noise_g
+    noise = rng.normal(size=(count, 3)) * noise_g
+    columns['reading'] = predict(model, force, add_turns(known), noise)
     columns['rate'] = known['rate'] + rng.normal(size=(count, 3)) * gyro_noise
     return Recording(columns, numbered(columns))

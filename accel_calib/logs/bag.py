@@ -259,7 +259,8 @@ _BLOCK_BYTES = 1 << 24
 
 NUMBERS = ('float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32', 'int64',
            'uint64')
-_TIMES = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
+_NO_QUANTITIES = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time',
+                  'builtin_interfaces/msg/Duration', 'std_msgs/msg/MultiArrayLayout')
 
 Received = tuple['Connection', int, bytes]
 """Connection, time of receipt [ns] and serialized message."""
@@ -334,7 +335,7 @@ class Bag:
         return self.joined(block, topic, msgtype).frame_ids[0] if block else ''
 
     def numbers(self, connection: 'Connection') -> tuple[str, ...]:
-        """Return the paths of the single numbers of a message, without headers and times."""
+        """Return the paths of the single numbers of a message that can be a quantity."""
         from rosbags.interfaces import Nodetype
 
         types = types_of(connection.msgdef, connection.msgtype, self.ros2).fielddefs
@@ -343,7 +344,7 @@ class Bag:
             for name, (kind, about) in types[msgtype][1]:
                 if kind == Nodetype.BASE and str(about[0]) in NUMBERS:
                     yield '.'.join((*path, name))
-                elif kind == Nodetype.NAME and str(about) not in _TIMES:
+                elif kind == Nodetype.NAME and str(about) not in _NO_QUANTITIES:
                     yield from below(str(about), (*path, name))
 
         known = connection.msgtype in types

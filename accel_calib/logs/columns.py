@@ -128,6 +128,11 @@ class LogOptions:
     in_child: bool = True
     partial: bool = False
 
+    def __post_init__(self) -> None:
+        for name in ('columns', 'context'):
+            if not isinstance(given := getattr(self, name), Mapping):
+                raise ValueError(f'{name} is {given!r}, expected a mapping by column')
+
     @property
     def instance(self) -> str:
         """Return `sensor`, of a flight log: ``1.0``, as programs write a number, is 1."""
@@ -411,8 +416,8 @@ def _sources(layout: TextLayout, given: Mapping[str, str]) -> dict[str, int]:
     # What is not asked for, and holds other text than numbers, does not stand in the way.
     return {ours: k for ours, k in found.items() if given.get(ours, ours) and (
         ours not in (*RATE, *CONTEXT) or ours in given or layout.name(k) == ours
-        or _are_numbers([cell for cell in layout.first(k)[:_FIRST_ROWS] if not (
-            ours in CONTEXT and not is_filled(cell))]))}
+        or _are_numbers(layout.first(k)[:_FIRST_ROWS] if ours in RATE else [
+            *filter(is_filled, layout.first(k))] or ['']))}
 
 
 def column(layout: TextLayout, theirs: str) -> int:

@@ -440,6 +440,7 @@ class Frame:
             raise InputError(f'{self} has several columns {some(twice)}, expected one of each',
                              'remove or rename the others')
         columns = {str(name): self.data[name] for name in self.data.columns}
+        are_names = not all(isinstance(name, int) for name in self.data.columns)
         index, about = getattr(self.data, 'index', None), getattr(self.data, 'attrs', {})
         if index is not None and (index.name is not None or index.dtype.kind in 'fMm'):
             columns = {str(index.name or 'time'): index, **columns}
@@ -457,6 +458,7 @@ class Frame:
                 elif cells.dtype.kind == 'm':
                     cells = cells / np.timedelta64(1, 's')
                 parts.append(cells.tolist())
-            yield from csv_of(chain([list(columns)], zip(*parts, strict=True)))
+            names = [list(columns)] if are_names else []  # numbers would be read as a row
+            yield from csv_of(chain(names, zip(*parts, strict=True)))
 
         return Member('', len(columns) * len(self.data) * CELL_BYTES, lines)

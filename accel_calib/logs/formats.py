@@ -365,7 +365,8 @@ _ZIP = rb'PK\x03\x04'
 FORMATS = (
     Format('a bag', ('.mcap', '.db3', '.bag'), b'', opened=_bag, needs='rosbags',
            module='rosbags.rosbag2',
-           again='use another bag, or one file of it; ros2 bag reindex may repair this one'),
+           again='use another bag, or one file of it; mcap recover repairs an mcap file that is '
+           'cut, and ros2 bag reindex a metadata.yaml'),
     Format('a PX4 log', ('.ulg',), rb'ULog\x01\x12\x35', read_ulg, 'pyulog', opened=_flight,
            again=_VEHICLE),
     Format('an ArduPilot log', ('.bin',), DATAFLASH, read_dataflash, 'pymavlink', opened=_flight,

@@ -5,9 +5,10 @@
 Noise figures of a sensor from the longest rest of a recording.
 
 **Rest.** The detector of `accel_calib.stillness` finds the rests, which end at an interruption of
-the stamps. A few missing samples are replaced by the sample before, because a recording that loses
-one sample in a thousand would otherwise have no long rest. Stamps with jitter are not used one by
-one: samples come from a regular clock, and their order is right.
+the stamps. A few missing samples are left out, because a recording that loses one sample in a
+thousand would otherwise have no long rest; a sample in their place that repeats another one would
+make the white noise too large. Stamps with jitter are not used one by one: samples come from a
+regular clock, and their order is right.
 
 Accelerometers and gyros have three figures by axis: the white-noise density N (velocity or angle
 random walk), the bias instability B and the random walk K (of the acceleration, or of the rate).
@@ -251,19 +252,15 @@ def _regular(rest: Recording, units: Units) -> LongRest:
     late = step > _LONG * usual
     missing = np.maximum(np.round(step[late] / usual) - 1.0, 0.0).sum() if usual > 0.0 else np.inf
     if not 0.0 < missing <= _MOST_MISSING * len(time):
-        rate = (len(time) - 1) / float(time[-1] - time[0])
-        mean = float(np.mean(step))
+        missing, mean = 0.0, float(np.mean(step))
         if float(np.std(step)) > _UNEVEN * mean:
             notes.append(
                 f'the stamps are uneven ({np.min(step) * 1e3:.3g} to {np.max(step) * 1e3:.3g} ms '
                 f'apart): the samples are taken as regular, one each {mean * 1e3:.4g} ms')
     else:
-        steps = np.where(late, np.maximum(np.round(step / usual), 1.0), 1.0)
-        place = np.append(0.0, np.cumsum(steps)).astype(np.int64)
-        rate = place[-1] / float(time[-1] - time[0])
-        rest = rest.take(np.searchsorted(place, np.arange(place[-1] + 1), side='right') - 1)
-        notes.append(f'{counted(int(missing), "sample")} of {len(rest)} are missing in the rest, '
-                     'and are replaced by the sample before')
+        notes.append(f'{counted(int(missing), "sample")} of {len(time) + int(missing)} are '
+                     'missing in the rest: those around them are taken as successive')
+    rate = (len(time) + missing - 1.0) / float(time[-1] - time[0])
     values = units.to_g(rest.reading.T)
     if 'rate' in rest:
         values = np.concatenate([values, rest['rate'].T])
