@@ -155,6 +155,8 @@ def test_rests_with_times_in_another_unit_are_read_right_or_refused_with_the_uni
         assert run_json(capsys, 'thermal', path)[1]['thermal']['degree'] == 2
     path.write_text(path.read_text().replace('time', 'time_ns', 1))  # they are in µs
     assert 'probably in a unit that is 1000' in refused(capsys, 'thermal', path)
+    write_table(path, rests.with_columns(temperature=rests['temperature'] + 273.15))
+    assert 'state its unit in the name' in refused(capsys, 'thermal', path)
 
 
 @pytest.mark.parametrize(('low', 'high', 'reference'), [

@@ -100,7 +100,7 @@ def _store_thermal(args: argparse.Namespace, logs: Sequence[Path], outcome: Ther
     curve, values = outcome.curve, Table(title='Effects of temperature', show_header=False)
     for each in effect_figures(calibration):
         values.add_row(each.label, with_sd(each.value, each.sd), each.unit)
-    low, high = curve.range_c
+    band, (low, high) = f', uncertainty up to {short(curve.band_mg)} mg', curve.range_c
     errors = [*curve.held_out_mg.values()]
     return _store(
         args, outcome,
@@ -113,7 +113,7 @@ def _store_thermal(args: argparse.Namespace, logs: Sequence[Path], outcome: Ther
         shown=[values if curve.model.effects else
                'the offset does not change with the temperature',
                f'degree {curve.degree} from {low:.1f} to {high:.1f} °C: {short(curve.change_mg)} '
-               f'-> {short(curve.residual_mg)} mg, uncertainty up to {short(curve.band_mg)} mg',
+               f'-> {short(curve.residual_mg)} mg{band if curve.model.effects else ""}',
                f'held-out parts of the log: {short(errors[0])} -> {short(errors[-1])} mg',
                *(_tables(calibration) if is_whole and args.verbose else ())],
         page=partial(thermal_page, outcome, list(map(str, logs)), stored=str(args.output),
