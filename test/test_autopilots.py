@@ -154,17 +154,6 @@ def test_an_external_accelerometer_of_px4_has_a_rotation_of_its_own(raw, tmp_pat
     undone(path, raw)
 
 
-@pytest.mark.parametrize(('number', 'names'), [
-    (100, ('AHRS_CUSTOM_ROLL', 'AHRS_CUSTOM_PIT', 'AHRS_CUSTOM_YAW')),
-    (101, ('CUST_ROT1_ROLL', 'CUST_ROT1_PITCH', 'CUST_ROT1_YAW')),
-    (102, ('CUST_ROT2_ROLL', 'CUST_ROT2_PITCH', 'CUST_ROT2_YAW'))])
-def test_a_custom_rotation_is_undone(number, names, raw, tmp_path):
-    angles = (12.0, -70.0, 33.0)
-    rotation = Rotation.from_euler('xyz', angles, degrees=True).as_matrix()
-    stated = {**old_ardupilot(number), **dict(zip(names, angles))}
-    undone(ardupilot_log(tmp_path / 'log.bin', logged(raw, rotation), stated), raw)
-
-
 @pytest.mark.parametrize(('parameters', 'why'), [
     ({}, 'parameters are not in the log'), ({'AHRS_ORIENTATION': 77.0}, 'is 77'),
     ({'AHRS_ORIENTATION': 0.0, 'INS_ACCSCAL_X': 0.0}, 'scale is 0'),
