@@ -93,7 +93,7 @@ def test_more_rows_than_a_person_poses_are_samples(tmp_path: Path) -> None:
 def test_a_long_log_is_read_in_blocks_of_flat_memory_as_at_once(tmp_path: Path) -> None:
     block = np.round(1000.0 * make.recording(1, rate_hz=100.0).reading, 3).tolist()
     peaks = []
-    for times in (20, 50):
+    for times in (40, 80):
         lines = [f'{10 * k},{x},{y},{z}\n' for k, (x, y, z) in enumerate(block * times)]
         path = write(tmp_path, ''.join(['millis,accX,accY,accZ\n', *lines]))
         tracemalloc.start()
