@@ -148,23 +148,6 @@ def test_px4_corrects_the_sensor_with_what_a_log_of_any_rotation_gives(number, r
     assert found['CAL_ACC1_ID'] == DEVICE
 
 
-def test_an_external_accelerometer_of_px4_has_a_rotation_of_its_own(raw, tmp_path):
-    path = px4_log(tmp_path / 'log.ulg', logged(raw, named('YAW_90')),
-                   {**old_px4(4), 'CAL_ACC1_ROT': 2})
-    undone(path, raw)
-
-
-@pytest.mark.parametrize(('number', 'names'), [
-    (100, ('AHRS_CUSTOM_ROLL', 'AHRS_CUSTOM_PIT', 'AHRS_CUSTOM_YAW')),
-    (101, ('CUST_ROT1_ROLL', 'CUST_ROT1_PITCH', 'CUST_ROT1_YAW')),
-    (102, ('CUST_ROT2_ROLL', 'CUST_ROT2_PITCH', 'CUST_ROT2_YAW'))])
-def test_a_custom_rotation_is_undone(number, names, raw, tmp_path):
-    angles = (12.0, -70.0, 33.0)
-    rotation = Rotation.from_euler('xyz', angles, degrees=True).as_matrix()
-    stated = {**old_ardupilot(number), **dict(zip(names, angles))}
-    undone(ardupilot_log(tmp_path / 'log.bin', logged(raw, rotation), stated), raw)
-
-
 @pytest.mark.parametrize(('parameters', 'why'), [
     ({}, 'parameters are not in the log'), ({'AHRS_ORIENTATION': 77.0}, 'is 77'),
     ({'AHRS_ORIENTATION': 0.0, 'INS_ACCSCAL_X': 0.0}, 'scale is 0'),
@@ -217,22 +200,6 @@ def test_an_old_thermal_calibration_of_px4_is_undone_and_replaced(raw, tmp_path)
     found = qgroundcontrol(export(calibrated(path), 'px4').text_or_bytes)
     assert found['TC_A2_ID'] == DEVICE
     assert {found[f'TC_A2_X{k}_{axis}'] for k in range(4) for axis in range(3)} == {0.0}
-
-
-def test_parameters_that_change_in_a_log_hold_from_then_on(raw, tmp_path):
-    half = len(raw) // 2
-    reading = np.concatenate([logged(raw, np.eye(3)).reading[:half], raw.reading[half:]])
-    imu = make.imu_rows(raw.with_columns(reading=reading), 0)
-    reset = {**three('INS_ACCOFFS_', '', np.zeros(3)), **three('INS_ACCSCAL_', '', np.ones(3))}
-    rows = [*make.dataflash_forms(),
-            *(('PARM', (1, name, value, 0.0)) for name, value in old_ardupilot(0).items()),
-            *imu[:half],
-            *(('PARM', (imu[half][1][0], name, value, 0.0)) for name, value in reset.items()),
-            # The orientation takes effect when the vehicle is booted again.
-            ('PARM', (imu[half][1][0], 'AHRS_ORIENTATION', 4.0, 0.0)), *imu[half:]]
-    path = tmp_path / 'log.bin'
-    path.write_bytes(make.dataflash_bytes(rows))
-    undone(path, raw)
 
 
 def test_the_second_accelerometer_of_ardupilot_keeps_its_place_in_every_file(raw, tmp_path):

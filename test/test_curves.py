@@ -6,7 +6,8 @@
 import re
 
 from accel_calib.calibration import fit_poses
-from accel_calib.effects import effect_named, EMPIRICAL, EmpiricalCurve, formula_of, kind_of
+from accel_calib.effects import (
+    effect_named, EMPIRICAL, EmpiricalCurve, entry_of, formula_of, kind_of)
 from accel_calib.findings import rate
 from accel_calib.refinement import refine
 from accel_calib.report import calibration_page
@@ -51,6 +52,16 @@ def test_a_name_that_is_no_curve_is_refused(name):
         effect_named(name)
     with pytest.raises(ValueError, match='expected one of'):
         Model({name: np.zeros(3)})
+
+
+@pytest.mark.parametrize('name', [name for name in CURVES if entry_of(effect_named(name)).needs])
+def test_a_curve_is_constant_outside_of_its_range(name):
+    variable, (low, high) = effect_named(name).variable, CURVES[name][-2:]
+    at = np.maximum([low - 1.0, low, high, 1e3 * high], 0.0)
+    reading = predict(model_with({name: CURVES[name]}), np.tile([0.6, -0.48, 0.64], (4, 1)),
+                      {variable: np.column_stack([at] * 3) if variable == 'std' else at})
+    np.testing.assert_array_equal(reading[[0, 3]], reading[[1, 2]])
+    assert np.max(np.abs(reading[2] - reading[1])) > 1e-3
 
 
 def test_a_gain_that_depends_on_the_direction_has_the_forms_of_its_degrees():

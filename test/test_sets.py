@@ -299,6 +299,15 @@ def test_a_held_out_residual_beside_a_walk_is_predicted_by_the_other_orientation
     np.testing.assert_allclose(left, np.linalg.solve(variance, beside(np.arange(15))))
 
 
+@pytest.mark.parametrize('seed', [2, 8])
+def test_an_effect_that_a_walk_hides_is_found_beside_the_walk(seed):
+    steps = np.random.default_rng(seed).normal(size=(COUNT, 3))
+    poses = poses_of({'offset_temperature': [3e-4, -2.1e-4, 2.1e-4]}, seed=seed)
+    poses = poses.with_columns(reading=poses.reading + np.cumsum(steps * 3e-3, axis=0))
+    found = search_effects(poses, Model({name: np.zeros(3) for name in BASE}))
+    assert found.added == ('offset_temperature', 'offset_wander')
+
+
 @pytest.mark.parametrize(('seed', 'stays'), [(5, True), (3, False)])
 def test_a_walk_is_estimated_anew_beside_fewer_effects(seed, stays):
     steps = np.random.default_rng(seed).normal(size=(COUNT, 3))

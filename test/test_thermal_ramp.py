@@ -113,7 +113,7 @@ def test_a_step_of_less_than_1_mg_is_not_named(size_g):
 @pytest.mark.parametrize('wander_g', [0.0, 3e-4, 1e-3])
 def test_deviations_include_correlated_noise_which_does_not_raise_the_degree(wander_g):
     runs = [curve(ramp(seed, LINE, wander_g=wander_g, rate_hz=2.0))
-            for seed in sample(range(200, 225), 8)]
+            for seed in sample(range(200, 225), 4)]
     assert {each.model.effects for each in runs} == {('offset_temperature',)}
     away = np.array([(values - LINE) / deviations
                      for values, deviations in map(coefficients, runs)])

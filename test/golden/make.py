@@ -13,7 +13,8 @@ import sys
 from tempfile import TemporaryDirectory
 import time
 
-sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parents[1])]
+ROOT = Path(__file__).parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / 'test'), str(ROOT / 'benchmarks')]
 
 from golden.cases import CASES, result_of  # noqa: E402
 from golden.record import EXPECTED, text_of  # noqa: E402

@@ -179,7 +179,7 @@ def mountings() -> Any:
                 level(levelled, made.predict(tilted[np.newaxis])[0], 'ros').rotation]
 
     return [_grid(flat, FRAMES, range(len(ups))), mounting_figures(turn, 'imu', 'base'),
-            _grid(near, (4.0, 9.0, 11.0, 60.0, 169.0, 171.0))]
+            _grid(near, (4.0, 9.0, 11.0, 60.0, 84.0, 169.0, 171.0))]
 
 
 def transforms() -> Any:
