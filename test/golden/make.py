@@ -13,8 +13,7 @@ import sys
 from tempfile import TemporaryDirectory
 import time
 
-ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / 'test'), str(ROOT / 'benchmarks')]
+sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parents[1])]
 
 from golden.cases import CASES, result_of  # noqa: E402
 from golden.record import EXPECTED, text_of  # noqa: E402
