@@ -31,7 +31,6 @@ import time
 from typing import Any
 
 from accel_calib.ros.simulator_node import SimulatedImu, SimulatorSettings
-from diagnostic_msgs.srv import SelfTest
 from figures import ROOT
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +42,6 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from sensor_msgs.msg import Imu, Temperature
-from shared import KNOWN
 from std_srvs.srv import Trigger
 
 Stamps = NDArray[np.int64]
@@ -108,6 +106,8 @@ def drive(rate: str, file: str) -> None:
     Once they are prepared, it says so, and waits for a line before it enters DDS.
 
     """
+    from shared import KNOWN  # here: a relay, whose memory is measured, does without
+
     per_s, record = float(rate), Record(Path(file))
     often = per_s or 1e4
     settings = SimulatorSettings(  # fewer poses where they have more samples
@@ -197,6 +197,8 @@ def relay(kind: str, topic: str) -> None:
 
 def ask(file: str) -> None:
     """Call the self-test for each number on standard input until it answers; record the number."""
+    from diagnostic_msgs.srv import SelfTest
+
     caller, record = Caller(), Record(Path(file))
     for number in sys.stdin:
         while not caller.call('self_test', SelfTest, 5.0).id:
