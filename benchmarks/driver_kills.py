@@ -111,8 +111,8 @@ class World:
 
     def died(self) -> dict[str, int]:
         """Return the exit statuses of the processes that have ended."""
-        return {name: process.returncode for name, process in self.running.items()
-                if process.poll() is not None}
+        return {name: program.returncode for name, program in self.running.items()
+                if program.poll() is not None}
 
     def wait(self, over: Callable[[], object]) -> bool:
         """Wait until a condition holds; return whether it does and no process has ended."""

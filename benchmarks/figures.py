@@ -34,10 +34,10 @@ ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / 'shared' / 'data'
 """Folder of real recordings."""
 
-MODULES = {
-    'compare': 'changes', 'watching': 'changes', 'geometry': 'poses', 'next_pose': 'poses',
-    'rating': 'trust', 'robustness': 'trust', 'fits': 'speed', 'refine_cost': 'speed',
-    'recordings': 'speed', 'memory': 'speed'}
+MODULES = {page: module for module, pages in (
+    ('changes', ('compare', 'watching')), ('poses', ('geometry', 'next_pose', 'plans')),
+    ('speed', ('fits', 'refine_cost', 'recordings', 'memory')),
+    ('trust', ('rating', 'robustness'))) for page in pages}
 """Modules of pages with another name."""
 
 sys.path[:0] = [str(ROOT), str(ROOT / 'test'), str(ROOT / 'benchmarks')]
@@ -104,9 +104,8 @@ def markdown(heads: Sequence[object], rows: Iterable[Iterable[object]]) -> str:
 
 @dataclass(frozen=True)
 class Frame:
-    """The file of a page, None if it is only printed, and a pool of processes for its sets."""
+    """A pool of processes for the sets of a page; without one, they run in this process."""
 
-    path: Path | None
     pool: Any = None
 
     def run(self, work: Callable[..., Any], tasks: Iterable[tuple[Any, ...]]) -> list[Any]:
@@ -170,8 +169,7 @@ def main() -> None:
     A page is a function with the name of its file in ``docs/figures``. It takes a `Frame` and
     options, and yields what it finds: tables, and phrases. The words beside them stand in the
     file. The options of the command line are those of the function, with their defaults: a
-    number, False for a switch, None for a path, or a tuple of words or numbers. `sets` brings
-    `--jobs` along.
+    number, False for a switch, or a tuple of words or numbers. `sets` brings `--jobs` along.
 
     """
     name = sys.argv[1] if len(sys.argv) > 1 else ''
@@ -182,7 +180,7 @@ def main() -> None:
     options = argparse.ArgumentParser(prog=f'figures.py {name}')
     for option, parameter in list(inspect.signature(page).parameters.items())[1:]:
         usual = parameter.default
-        kind: dict[str, Any] = {'type': Path if usual is None else type(usual)}
+        kind: dict[str, Any] = {'type': type(usual)}
         if usual is False:
             kind = {'action': 'store_true'}
         elif isinstance(usual, tuple):
@@ -200,7 +198,7 @@ def main() -> None:
     with ExitStack() as stack:
         pool = (stack.enter_context(multiprocessing.get_context('spawn').Pool(jobs)) if jobs > 1
                 else None)
-        parts = list(page(Frame(path, pool), **given))
+        parts = list(page(Frame(pool), **given))
     text = update(file.read_text(encoding='utf-8'), parts)
     text = re.sub(r'(Made by\s)`[^`]*`', lambda found: f'{found[1]}`{command}`', text)
     text = re.sub(r'(Machine: |` on |^)[^,\n]+, \d+ cores, load .*?numpy [\d.]*\d',
@@ -250,14 +248,11 @@ def commit() -> str:
 
 def machine() -> str:
     """Return the processor with its load, the system and the versions."""
-    try:
-        text = Path('/proc/cpuinfo').read_text(encoding='utf-8')
-        name = next(line.split(':')[1].strip() for line in text.splitlines()
-                    if line.startswith('model name'))
-    except (OSError, StopIteration):
-        name = platform.processor() or platform.machine()
-    return (f'{name}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before; Linux '
-            f'{platform.release()}, Python {platform.python_version()}, numpy {version("numpy")}')
+    text = Path('/proc/cpuinfo').read_text(encoding='utf-8')
+    name = re.search(r'model name\s*: (.*)', text)
+    return (f'{name[1] if name else platform.machine()}, {os.cpu_count()} cores, load '
+            f'{os.getloadavg()[0]:.1f} before; Linux {platform.release()}, Python '
+            f'{platform.python_version()}, numpy {version("numpy")}')
 
 
 if __name__ == '__main__':

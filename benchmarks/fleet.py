@@ -4,11 +4,8 @@
 """
 A fleet of simulated sensors, calibrated on a local cluster.
 
-The pose tables are made first. Every sensor has values of its own; some sensors drift or change
-for good, some are far from the others, and some files are damaged. A second call with the same
-folder continues the first one::
-
-    python benchmarks/figures.py fleet --folder /tmp/fleet --markdown docs/figures/fleet.md
+The pose tables are made first, in a folder below TMPDIR. Every sensor has values of its own; some
+sensors drift or change for good, some are far from the others, and some files are damaged.
 
 """
 
@@ -20,7 +17,6 @@ from datetime import datetime, timedelta, timezone
 import functools
 import os
 from pathlib import Path
-import shutil
 from tempfile import TemporaryDirectory
 import time
 from typing import Any
@@ -79,9 +75,6 @@ TIMED = {True: 200, False: 1200}
 TURNS = 3
 """Number of times that both are timed, in turns."""
 
-MILLION = 1_000_000
-HOUR_S = 3600.0
-
 
 # ----------------------------------------------------------------------------------------- sensors
 
@@ -118,27 +111,21 @@ def draw_sensor(number: int, calibrations: int, seed: int) -> Sensor:
 
 
 def write_sensor(folder: Path, number: int, calibrations: int, seed: int) -> None:
-    """Write the pose tables of a sensor, some of them damaged, unless they are there."""
-    made = draw_sensor(number, calibrations, seed)
-    if (folder / made.name).exists():
-        return
-    rng = np.random.default_rng([seed, number, 1])
-    new = folder / f'.{made.name}'
-    shutil.rmtree(new, ignore_errors=True)
-    new.mkdir(parents=True)
+    """Write the pose tables of a sensor, some of them damaged."""
+    made, rng = draw_sensor(number, calibrations, seed), np.random.default_rng([seed, number, 1])
+    (folder / made.name).mkdir(parents=True)
     for k in range(calibrations):
         begin = FIRST + k * EVERY
         poses = ac.simulate(
             made.at(k), poses=POSES, seed=int(rng.integers(2 ** 32)),
             time=begin.timestamp() + 10.0 * np.arange(POSES),
             temperature=np.sort(rng.uniform(20.0, 35.0, POSES)) if 'B' in made.name else ())
-        path = new / f'{begin:%Y-%m-%d}.csv'
+        path = folder / made.name / f'{begin:%Y-%m-%d}.csv'
         write_table(path, replace(poses, sensor=''))
         if rng.uniform() < DAMAGED:
             lines = path.read_text(encoding='utf-8').splitlines(keepends=True)
             damaged = (['the logger was off\n'], lines[:6], [])[int(rng.integers(3))]
             path.write_text(''.join(damaged), encoding='utf-8')
-    new.rename(folder / made.name)
 
 
 def is_change_right(made: Sensor, row: Row) -> bool:
@@ -208,7 +195,7 @@ def memory_mb(client: Any) -> tuple[float, float]:
 
 
 def watch_run(found: Sequence[Input], options: Options, workers: int, folder: Path) -> Run:
-    """Calibrate recordings on a cluster of this machine, or those that are left."""
+    """Calibrate recordings on a cluster of this machine."""
     clocks, memory = [], {}
 
     def look() -> None:
@@ -287,22 +274,15 @@ def lines_of_costs(speeds: Mapping[bool, Floats], done: Run, calibrations: int, 
     yield Line('its comparison with others of the sensor, on a worker, ms', f'{1e3 * end_s:.1f}')
     for kind, search in (('the search', True), ('no search', False)):
         more_s = alone_s[search] - alone_s[refined]
-        hours = MILLION * calibrations * (each_s + end_s + more_s) / HOUR_S
+        hours = 1e6 * calibrations * (each_s + end_s + more_s) / 3600.0
         yield Line(f'a million robots with {calibrations} recordings each and {kind}, core hours',
                    f'{hours:,.0f}')
 
 
 def fleet(frame: Frame, sensors: int = 10_000, calibrations: int = 20, workers: int = 2,
-          seed: int = 1, no_refine: bool = False, folder: Path | None = None) -> Iterator[str]:
-    """
-    Yield the parts of the page.
-
-    The recordings and the results are in `folder`, where a second call continues; by default in a
-    temporary one.
-
-    """
+          seed: int = 1, no_refine: bool = False) -> Iterator[str]:
     with TemporaryDirectory() as temporary:
-        folder = (folder or Path(temporary)).absolute()
+        folder = Path(temporary)
         with ProcessPoolExecutor(workers) as pool:
             list(pool.map(functools.partial(
                 write_sensor, folder / 'in', calibrations=calibrations, seed=seed),

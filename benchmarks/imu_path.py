@@ -156,18 +156,6 @@ def lines_of_calls(runs: list[tuple[Trial, Phases]]) -> Iterator[Line]:
                    f'({count} calls)', len(runs), '≤ 2; 0', middle <= 2.0 and lost == 0)
 
 
-def plain_figures(trials: Trials) -> str:
-    """Return the plain figures as Markdown; they show the noise of the machine."""
-    rows = []
-    for name, each in trials.items():
-        used = [one.cpu_us for one in each]
-        rows.append((name, f'{np.median(used):.0f} ({min(used):.0f} to {max(used):.0f})', *(
-            f'{np.median([one.latency_us(percent) for one in each]):.0f}' if each[0].heard else ''
-            for percent in (50, 99))))
-    return markdown(('at 1 kHz', 'CPU per message, µs: median (least to most)', 'p50, µs',
-                     'p99, µs'), rows)
-
-
 def imu_path(frame: Frame, turns: int = 5, quick: bool = False) -> Iterator[str]:
     """Yield the parts of the page; quick: one short turn."""
     turns, seconds, long = (1, 2.0, 5.0) if quick else (turns, 6.0, 60.0)
@@ -203,4 +191,11 @@ def imu_path(frame: Frame, turns: int = 5, quick: bool = False) -> Iterator[str]
         many = {name: [between(commands[name], 8000.0, long)] for name in flood}
     yield table([*lines_at_1_khz(steady), *lines_of_starts(starts),
                  *lines_under_load(flood, many, long), *lines_of_calls(runs)])
-    yield plain_figures(steady)
+    rows = []  # plain figures, which show the noise of the machine
+    for name, each in steady.items():
+        used = [one.cpu_us for one in each]
+        rows.append((name, f'{np.median(used):.0f} ({min(used):.0f} to {max(used):.0f})', *(
+            f'{np.median([one.latency_us(percent) for one in each]):.0f}' if each[0].heard else ''
+            for percent in (50, 99))))
+    yield markdown(('at 1 kHz', 'CPU per message, µs: median (least to most)', 'p50, µs',
+                    'p99, µs'), rows)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-An hour of the node at 1 kHz: messages lost, memory, CPU time and latency, minute by minute.
+An hour of the node at 1 kHz: messages lost, memory, CPU time and latency, and their trends.
 
 A caller uses the services all the time. At the end of each round it resets the node, and the next
 round begins without poses and without a calibration.
@@ -15,14 +15,13 @@ from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
+from accel_calib.table import Floats
 from figures import check, Frame, Line, markdown, table, tell
 from nodes import CALIBRATED, Caller, client, cpu_seconds, node_command, run_trial, Trial
 import numpy as np
 from numpy.typing import NDArray
-
-Floats = NDArray[np.float64]
 
 CALLS = ('fit', 'refine', 'undo', 'save', 'load', 'capture_pose', 'set_level')
 """Services that are called in turn; the last two wait for the next rest of the sensor."""
@@ -39,14 +38,12 @@ KILOBYTE = 1.024e-3
 """Unit of the memory in /proc [MB]."""
 
 
-@dataclass(frozen=True)
-class Answer:
-    """The answer of a service, and the time that it took [s]; without words none came."""
+class Answer(NamedTuple):
+    """A call of a service: its time [s] and the response; without words none came."""
 
     name: str
     seconds: float
-    success: bool
-    words: str
+    response: Any
 
 
 @dataclass(frozen=True)
@@ -157,8 +154,8 @@ def run_rounds(rounds: int, seconds: float, interval: float, rate: float) -> Lon
                 caller.wait(time.monotonic() + 20.0, lambda: rests[0] > before)
                 caller.wait(time.monotonic() + REST)
             called = time.monotonic()
-            found = caller.call(name)
-            answers.append(Answer(name, time.monotonic() - called, found.success, found.message))
+            response = caller.call(name)
+            answers.append(Answer(name, time.monotonic() - called, response))
 
         caller.node.create_subscription(Bool, 'calibrator/still', on_still, 10)
         caller.node.create_timer(interval, lambda: samples.append(take_sample(node, relay)))
@@ -192,8 +189,8 @@ def trend_words(slope: float, error: float, unit: str) -> str:
 
 def lines_of(run: LongRun) -> Iterator[Line]:
     lost, bare = (sum(part.lost(program) for part in run.parts) for program in (0, 1))
-    answered = [each for each in run.answers if each.words]
-    refused = sum(not each.success for each in answered)
+    answered = [each for each in run.answers if each.response.message]
+    refused = sum(not each.response.success for each in answered)
     faults = sum(map(run.trial.log.count, ('Traceback', 'unexpected error')))
     yield check('messages lost', f'{lost} of {run.sent.sum():,} (bare relay: {bare})', lost,
                 least=0, most=0)
@@ -234,13 +231,13 @@ def long_run(frame: Frame, minutes: float = 60.0, rate: float = 1000.0) -> Itera
         seconds, interval = 60.0 * minutes / rounds, 6.0 * minutes / rounds
     run = run_rounds(rounds, seconds, interval, rate)
     for each in run.answers:
-        if not each.success:
-            tell(f'{each.name}: {each.words or "no answer"}')
+        if not each.response.success:
+            tell(f'{each.name}: {each.response.message or "no answer"}')
     yield table(lines_of(run))
     called = {name: found for name in (*CALLS, 'reset') if (
         found := [each for each in run.answers if each.name == name])}
     yield markdown(('service', 'calls', 'failed', 'longest answer, s'), (
-        (f'`~/{name}`', len(found), sum(not each.success for each in found),
+        (f'`~/{name}`', len(found), sum(not each.response.success for each in found),
          f'{max(each.seconds for each in found):.2f}') for name, found in called.items()))
     yield f'through poses at {rate:g} Hz'
     yield f'at the end of each round of {seconds:g} s'

@@ -152,20 +152,6 @@ class Tests:
         return sorted(found, key=lambda name: self.seconds[name])
 
 
-def is_killed(given: Mutant, tests: Tests, where: Path) -> bool:
-    """Return whether a test fails, or does not end, in a copy with the mutant."""
-    names = tests.of(given.file, given.lines)
-    if not names:
-        return False
-    (where / 'tests.txt').write_text('\n'.join(names))
-    original = (where / given.file).read_text()
-    (where / given.file).write_text(given.code)
-    try:
-        return run_tests(where, '-x', '@tests.txt') != 0
-    finally:
-        (where / given.file).write_text(original)
-
-
 def mutants(frame: Frame, count: int = 300, seed: int = 1) -> Iterator[str]:
     """Yield the share that is killed by folder, and the mutants that survive."""
     drawn = list(draw_mutants(count, seed))
@@ -176,16 +162,21 @@ def mutants(frame: Frame, count: int = 300, seed: int = 1) -> Iterator[str]:
         for number in range(workers):
             copies.put(copy_to(Path(folder, str(number))))
 
-        def try_one(given: Mutant) -> bool:
-            where = copies.get()
+        def is_killed(given: Mutant) -> bool:
+            """Return whether a test fails, or does not end, in a copy with the mutant."""
+            names, where = tests.of(given.file, given.lines), copies.get()
+            original = (where / given.file).read_text()
             try:
-                return is_killed(given, tests, where)
+                (where / 'tests.txt').write_text('\n'.join(names))
+                (where / given.file).write_text(given.code)
+                return bool(names) and run_tests(where, '-x', '@tests.txt') != 0
             finally:
+                (where / given.file).write_text(original)
                 copies.put(where)
 
         rows, folders, survived = [], Counter[str](), Counter[str]()
         with ThreadPoolExecutor(workers) as pool:
-            for done, (given, killed) in enumerate(zip(drawn, pool.map(try_one, drawn)), 1):
+            for done, (given, killed) in enumerate(zip(drawn, pool.map(is_killed, drawn)), 1):
                 folder_of = given.file.split('/')[1]  # or a module of the base
                 folders[folder_of] += 1
                 if not killed:

@@ -31,7 +31,6 @@ import time
 from typing import Any
 
 from accel_calib.ros.simulator_node import SimulatedImu, SimulatorSettings
-from diagnostic_msgs.srv import SelfTest
 from figures import ROOT
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +42,6 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from sensor_msgs.msg import Imu, Temperature
-from shared import KNOWN
 from std_srvs.srv import Trigger
 
 Stamps = NDArray[np.int64]
@@ -81,6 +79,7 @@ class Record:
     SIZE = 2**24
 
     def __init__(self, file: Path) -> None:
+        self.file = file
         with file.open('a+b') as opened:
             opened.truncate(16 * self.SIZE)  # takes no space before it is written
             self._cells = memoryview(mmap.mmap(opened.fileno(), 16 * self.SIZE)).cast('q')
@@ -107,6 +106,8 @@ def drive(rate: str, file: str) -> None:
     Once they are prepared, it says so, and waits for a line before it enters DDS.
 
     """
+    from shared import KNOWN  # here: a relay, whose memory is measured, does without
+
     per_s, record = float(rate), Record(Path(file))
     often = per_s or 1e4
     settings = SimulatorSettings(  # fewer poses where they have more samples
@@ -163,22 +164,16 @@ def ended() -> Callable[[], bool]:
     return over.is_set
 
 
-def listen(*given: str) -> None:
-    """Record stamp and arrival of messages; `given` are, for each topic, a file and the topic."""
-    node = enter('user')
+def listen(file: str, topic: str) -> None:
+    """Record stamp and arrival of the messages of a topic."""
+    node, record = enter('user'), Record(Path(file))
 
-    def subscribe(file: str, topic: str) -> None:
-        record = Record(Path(file))
+    def on_imu(data: bytes) -> None:
+        now = time.monotonic_ns()
+        seconds, rest = _STAMP.unpack_from(data, _STAMP_AT)
+        record.add(seconds * NANO + rest, now)
 
-        def on_imu(data: bytes) -> None:
-            now = time.monotonic_ns()
-            seconds, rest = _STAMP.unpack_from(data, _STAMP_AT)
-            record.add(seconds * NANO + rest, now)
-
-        node.create_subscription(Imu, topic, on_imu, USER, raw=True)
-
-    for file, topic in zip(given[::2], given[1::2], strict=True):
-        subscribe(file, topic)
+    node.create_subscription(Imu, topic, on_imu, USER, raw=True)
     spin(node, EventsExecutor(), 0.05)
 
 
@@ -202,6 +197,8 @@ def relay(kind: str, topic: str) -> None:
 
 def ask(file: str) -> None:
     """Call the self-test for each number on standard input until it answers; record the number."""
+    from diagnostic_msgs.srv import SelfTest
+
     caller, record = Caller(), Record(Path(file))
     for number in sys.stdin:
         while not caller.call('self_test', SelfTest, 5.0).id:
@@ -326,25 +323,23 @@ def run_trial(programs: Mapping[str, list[str]], rate: float,
     with tempfile.TemporaryDirectory() as given, ExitStack() as stack:
         folder = Path(given)
         log, sent = folder / 'log', Record(folder / 'sent')
-        heard = {topic: folder / f'heard_{k}' for k, topic in enumerate(programs)}
-        records = [Record(file) for file in heard.values()]
+        heard = {topic: Record(folder / f'heard_{k}') for k, topic in enumerate(programs)}
 
         def wait_for(*filled: Record) -> None:
             if not wait_until(lambda: all(map(len, filled))):
                 raise RuntimeError(f'no messages after {PATIENCE:g} s: {log.read_text()}')
 
         enter_domain(folder)
-        if listened:
-            files = [part for topic, file in heard.items() for part in (file, topic)]
-            stack.enter_context(process(client('listen', *files), log))
-        driver = stack.enter_context(prepare_driver(rate, folder / 'sent', log))
+        for topic, record in heard.items() if listened else ():
+            stack.enter_context(process(client('listen', record.file, topic), log))
+        driver = stack.enter_context(prepare_driver(rate, sent.file, log))
         say(driver)
         wait_for(sent)
         time.sleep(lead)
         began = time.monotonic_ns()
         pids = [stack.enter_context(process(command, log)).pid for command in programs.values()]
         if listened:
-            wait_for(*records)
+            wait_for(*heard.values())
         time.sleep(SETTLE if listened else 2.0 * SETTLE)
         cpu, first = cpu_seconds(pids[0]), time.monotonic_ns()
         during(*pids)
@@ -353,7 +348,7 @@ def run_trial(programs: Mapping[str, list[str]], rate: float,
         driver.communicate(timeout=60)  # first: a flooded process may not notice its end
         time.sleep(0.3)
         stack.close()
-        pairs = [record.pairs() for record in records] if listened else []
+        pairs = [record.pairs() for record in heard.values()] if listened else []
         start = 1e-9 * (max(each[0, 1] for each in pairs) - began) if listened else np.nan
         return Trial(first, last, start, cpu, sent.pairs()[:, 0], tuple(pairs),
                      log.read_text(encoding='utf-8')).between(first, last)

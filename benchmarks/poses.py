@@ -1,25 +1,32 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which poses a fit needs: poor geometry, and the order in which poses are asked for."""
+"""
+Which poses a fit and a refinement need: poor geometry, the next pose, and plans.
+
+The plan of a refinement separates an effect from its twin. More poses of the same sensor are taken
+by the plan: its first pose, and then the first pose of the next plan; or at random. A set ends
+when one twin is certain, or after `LONGEST` poses.
+
+"""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import re
 
-from accel_calib.calibration import directions_of, fit_poses, next_pose as next_asked
+from accel_calib.calibration import directions_of, fit_poses, next_pose as next_asked, PlannedPose
 from accel_calib.effects import Model, model_with, predict, sensor_force, simulate_poses
 from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import closed_form, estimate, pose_noise, start_of
 from accel_calib.geometry import ATTITUDES, spread_directions, unit
+from accel_calib.refinement import refine, Refinement, Step
 from accel_calib.table import concatenated, Floats, Poses
-from accel_calib.units import units_of
 from figures import check, Frame, Line, markdown, share, table
+from generator import Around, measure, Setup, simulate, Simulated
 import numpy as np
-from sensors import length_error_mg, tilt
-from shared import FACES, poses_of, random_directions
+from sensors import length_error_mg, simulated_poses, tilt
+from shared import FACES, G, MPS2, poses_of, random_directions
 
-G = units_of('g')
 COUNT = 12
 FAR = 10.0
 """An error of |a| that nobody accepts: twice that of leaving out the cross-axis gains [mg]."""
@@ -35,8 +42,6 @@ HEADS = ('12 poses', 'model 10 refused', 'error of the refused fit, median (wors
          'error if not refused [mg]', 'offered instead', 'its error [mg]', 'poses to add',
          'error with them [mg]')
 
-Draw = Callable[[np.random.Generator], Floats]
-
 
 @dataclass(frozen=True)
 class Outcome:
@@ -50,46 +55,40 @@ class Outcome:
     with_added: float = np.nan  # of model 10 with these poses
 
 
-def draw_few(degrees: float, directions: Floats | None = None) -> Draw:
-    """Return a function that repeats few directions up to 12; by default five random ones."""
-    def draw(rng: np.random.Generator) -> Floats:
-        few = random_directions(5, rng) if directions is None else directions
-        return tilt(few[np.arange(COUNT) % len(few)], degrees, rng)
-    return draw
+def repeat_five(degrees: float, rng: np.random.Generator) -> Floats:
+    """Repeat five random directions up to 12, each held some degrees off."""
+    return tilt(random_directions(5, rng)[np.arange(COUNT) % 5], degrees, rng)
 
 
-def draw_plane(degrees: float) -> Draw:
-    """Return a function that draws poses about a random plane."""
-    def draw(rng: np.random.Generator) -> Floats:
-        angle = rng.uniform(0.0, 2.0 * np.pi, COUNT)
-        axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        ring = np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle]) @ axes.T
-        return tilt(ring, degrees, rng)
-    return draw
+def draw_plane(degrees: float, rng: np.random.Generator) -> Floats:
+    """Draw poses about a random plane, held some degrees off."""
+    angle = rng.uniform(0.0, 2.0 * np.pi, COUNT)
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    ring = np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle]) @ axes.T
+    return tilt(ring, degrees, rng)
 
 
-def draw_cone(degrees: float) -> Draw:
-    """Return a function that draws poses evenly in a cone about a random axis."""
-    def draw(rng: np.random.Generator) -> Floats:
-        z = rng.uniform(np.cos(np.radians(degrees)), 1.0, COUNT)
-        angle, radius = rng.uniform(0.0, 2.0 * np.pi, COUNT), np.sqrt(1.0 - z ** 2)
-        axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z]) @ axes.T
-    return draw
+def draw_cone(degrees: float, rng: np.random.Generator) -> Floats:
+    """Draw poses evenly in a cone about a random axis."""
+    z = rng.uniform(np.cos(np.radians(degrees)), 1.0, COUNT)
+    angle, radius = rng.uniform(0.0, 2.0 * np.pi, COUNT), np.sqrt(1.0 - z ** 2)
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z]) @ axes.T
 
 
-CASES: dict[str, tuple[Draw, float | None]] = {
-    **{f'5 directions, held {off:g}° off': (draw_few(off), 1.0 if off < 1 else None)
+CASES: dict[str, tuple[Callable[..., Floats], float, float | None]] = {
+    **{f'5 directions, held {off:g}° off': (repeat_five, off, 100.0 if off < 1 else None)
        for off in (0.0, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0)},
-    **{f'in a {angle:g}° cone': (draw_cone(angle), 1.0 if angle <= 45 else None)
+    **{f'in a {angle:g}° cone': (draw_cone, angle, 100.0 if angle <= 45 else None)
        for angle in (30.0, 45.0, 60.0, 75.0)},
-    **{f'in a plane, held {off:g}° off': (draw_plane(off), 1.0 if off < 2 else None)
+    **{f'in a plane, held {off:g}° off': (draw_plane, off, 100.0 if off < 2 else None)
        for off in (0.0, 1.0, 2.0, 5.0, 10.0)},
-    **{f'six faces twice, held {off:g}° off': (draw_few(off, FACES), 1.0 if off < 0.5 else None)
-       for off in (0.0, 0.5, 1.0, 2.0, 5.0)},
-    'random directions': (lambda rng: random_directions(COUNT, rng), 0.0),
-    'spread, held 10° off': (lambda rng: tilt(spread_directions(COUNT), 10.0, rng), 0.0)}
-"""How the directions are drawn, and the share of sets to be refused; None: nothing is asked."""
+    **{f'six faces twice, held {off:g}° off': (
+        lambda off, rng: tilt(np.vstack([FACES, FACES]), off, rng), off,
+        100.0 if off < 0.5 else None) for off in (0.0, 0.5, 1.0, 2.0, 5.0)},
+    'random directions': (lambda off, rng: random_directions(COUNT, rng), 0.0, 0.0),
+    'spread, held 10° off': (lambda off, rng: tilt(spread_directions(COUNT), off, rng), 10.0, 0.0)}
+"""How the directions are drawn, with an angle [°]; the share to be refused [%], if it is asked."""
 
 
 def force_fit(poses: Poses, reading: Floats) -> float:
@@ -135,10 +134,10 @@ def add_poses(poses: Poses | None, model: Model, directions: Floats, rng: np.ran
 
 def fit_set(name: str, seed: int, number: int) -> Outcome:
     """Draw a set and fit it."""
-    rng = np.random.default_rng([seed, number])
+    (draw, degrees, _), rng = CASES[name], np.random.default_rng([seed, number])
     model = draw_model(rng)
     reading = predict(model, random_directions(500, rng), {})
-    poses = add_poses(None, model, CASES[name][0](rng), rng)
+    poses = add_poses(None, model, draw(degrees, rng), rng)
     forced = force_fit(poses, reading)
     try:
         found = length_error_mg(fit_poses(poses, G, model='10').correct(reading))
@@ -171,10 +170,10 @@ def row_of(name: str, outcomes: Sequence[Outcome]) -> list[str]:
 def lines_of(found: dict[str, list[Outcome]]) -> Iterator[Line]:
     """Yield what is asked of each case, and of all sets."""
     for name, outcomes in found.items():
-        asked = CASES[name][1]
+        asked = CASES[name][2]
         if asked is not None:
             yield share(f'{name}: refused for model 10', (each.refused for each in outcomes),
-                        least=100.0 * asked, most=100.0 * asked)
+                        least=asked, most=asked)
     everything = [each for outcomes in found.values() for each in outcomes]
     kept = [each.error for each in everything if not each.refused]
     yield share(f'all sets whose fit would be wrong by more than {FAR:g} mg: refused',
@@ -265,3 +264,139 @@ def next_pose(frame: Frame, sets: int = 200, seed: int = 1) -> Iterator[str]:
                               f'{np.max(enough):.0f}), {np.median(there):.3f} mg', sets))
     yield table(lines)
     yield markdown(('poses', *SHOWN), rows)
+
+
+# ------------------------------------------------------------------------------------------ plans
+
+TWINS = (('quadratic', 'gain_asymmetry', 3.0, 'wandering'),
+         ('cubic', 'odd_quadratic', 3.0, 'wandering'),
+         ('offset_temperature', 'offset_drift', 2.0, 'rising'))
+"""Twins, the size of the hidden one, and the course of the temperature."""
+
+CERTAIN = 0.95
+LONGEST, TRIES = 40, 400
+"""Most further poses of a set, and most sets that are tried: in many, the twins are no rivals."""
+
+INTERVAL, SUPPLY = 35.0, 3.3
+"""Usual time between poses [s], and supply [V]."""
+
+
+@dataclass(frozen=True)
+class Named:
+    """The result of one set."""
+
+    planned: float  # poses until a name is certain; infinite: more than `LONGEST`
+    planned_right: bool  # whether that name is the hidden effect
+    random: float  # the same with poses at random
+    random_right: bool
+    before: float  # probability of the hidden effect before the plan,
+    expected: float  # that of the right one that the plan states,
+    after: float  # and that of the hidden effect with all poses of the plan
+    length: int  # poses of the first plan
+
+
+def extend_set(made: Simulated, up: Floats, temperature: float, wait: float,
+               rng: np.random.Generator) -> Simulated:
+    """
+    Return the poses of a sensor and one more in the pose table.
+
+    `up` is the direction that points up, and `wait` the time since the last pose [s].
+
+    """
+    setup = replace(made.setup, poses=1)
+    sigma = setup.noise_mg * 1e-3 * setup.shaking ** rng.uniform(size=(1, 3))
+    shaking = rng.normal(size=(1, 3, setup.samples)) * sigma[:, :, np.newaxis]
+    elapsed, warm = made.columns['time'][-1:] + wait, np.array([temperature])
+    around = Around(up[np.newaxis], elapsed, warm, warm, np.zeros(1), np.array([SUPPLY]),
+                    rng.normal(size=(1, 3)) * 0.002, shaking, sigma)
+    one = measure(rng, setup, around, made.traits, made.values)
+    return replace(made, columns={name: np.append(values, one.columns[name])
+                                  for name, values in made.columns.items()})
+
+
+def follow_plan(made: Simulated, pose: PlannedPose, wait: float, rng: np.random.Generator
+                ) -> Simulated:
+    """Add a planned pose; what the plan leaves open is as usual."""
+    temperature = pose.context.get('temperature', float(made.columns['temperature'][-1]))
+    return extend_set(made, np.array(pose.up), temperature, max(wait, INTERVAL), rng)
+
+
+def refine_set(made: Simulated, twins: Sequence[str]) -> tuple[Refinement, Step | None]:
+    """Return the refinement of the poses, and its step that names one of the twins."""
+    found = refine(simulated_poses(made), MPS2, base='10')
+    return found, next((step for step in found.steps if step.effect in twins), None)
+
+
+def take_until_certain(made: Simulated, twins: Sequence[str], rng: np.random.Generator, *,
+                       by_plan: bool) -> tuple[float, bool]:
+    """Return the number of poses until one of the twins is certain, and whether it is right."""
+    known = made.columns['temperature']
+    for count in range(LONGEST + 1):
+        found, step = refine_set(made, twins)
+        if step is not None and step.data_probabilities[step.effect] >= CERTAIN:
+            return count, step.effect in made.truth
+        up, warm = random_directions(1, rng)[0], float(rng.uniform(np.min(known), np.max(known)))
+        if by_plan and found.plan.poses:
+            first = found.plan.poses[0]
+            made = follow_plan(made, first, first.context.get('time', 0.0), rng)
+        else:
+            made = extend_set(made, up, warm, INTERVAL, rng)
+    return np.inf, False
+
+
+def name_twin(index: int, seed: int, number: int) -> Named | None:
+    """Return the outcome of one set, or None if the twins are no rivals in it."""
+    first, second, size, course = TWINS[index]
+    hidden, twins = (first, second)[number % 2], (first, second)
+    made = simulate(np.random.default_rng((seed, index, number)), {hidden: size},
+                    Setup(poses=24, rates='small', temperature=course))
+    found, step = refine_set(made, twins)
+    if step is None or not {*twins} <= {step.effect, *step.rivals} or (
+            max(step.data_probabilities.values()) >= CERTAIN or not found.plan.poses):
+        return None
+    rngs = [np.random.default_rng((seed, index, number, k)) for k in (1, 2, 3)]
+    planned = take_until_certain(made, twins, rngs[0], by_plan=True)
+    random = take_until_certain(made, twins, rngs[1], by_plan=False)
+    waited = 0.0
+    for pose in found.plan.poses:
+        wait = max(pose.context.get('time', 0.0) - waited, INTERVAL)
+        waited += wait
+        made = follow_plan(made, pose, wait, rngs[2])
+    after = refine_set(made, twins)[1]
+    return Named(*planned, *random, step.data_probabilities[hidden],
+                 found.plan.poses[-1].expected,
+                 after.data_probabilities.get(hidden, 0.0) if after else 0.0,
+                 len(found.plan.poses))
+
+
+def lines_of_twins(name: str, outcomes: Sequence[Named]) -> Iterator[Line]:
+    sets = len(outcomes)
+    planned, random = (float(np.median(each)) for each in zip(*(
+        (o.planned, o.random) for o in outcomes)))
+    words = [f'{each:.3g}' if np.isfinite(each) else f'over {LONGEST}'
+             for each in (planned, random)]
+    yield Line(f'{name}: poses until one is certain, planned instead of random (median)',
+               ' instead of '.join(words), sets, 'fewer', planned < random)
+    yield Line(f'{name}: the certain one is the hidden one, planned; random', '; '.join(
+        f'{sum(getattr(o, f"{way}_right") for o in outcomes)}/'
+        f'{sum(np.isfinite(getattr(o, way)) for o in outcomes)}' for way in ('planned', 'random')),
+        sets)
+    before, expected, after, length = np.mean([
+        (o.before, o.expected, o.after, o.length) for o in outcomes], axis=0)
+    error = np.std([o.after for o in outcomes]) / np.sqrt(sets)
+    yield Line(f'{name}: mean probability of the hidden one, before the first plan ({length:.1f} '
+               'poses); expected after it; found after it',
+               f'{before:.2f}; {expected:.2f}; {after:.2f} ± {error:.2f}', sets)
+
+
+def plans(frame: Frame, sets: int = 12, seed: int = 1) -> Iterator[str]:
+    """Yield the table; `sets` is the number for each pair of twins."""
+    lines: list[Line] = []
+    for index, (first, second, *_) in enumerate(TWINS):
+        outcomes: list[Named] = []
+        for start in range(0, TRIES, sets):
+            outcomes += filter(None, frame.run_sets(name_twin, sets, index, seed, first=start))
+            if len(outcomes) >= sets:
+                break
+        lines += lines_of_twins(f'{first} and {second}', outcomes[:sets]) if outcomes else []
+    yield table(lines)

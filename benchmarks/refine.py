@@ -26,15 +26,15 @@ from accel_calib.calibration import fit_poses, verify
 from accel_calib.refinement import refine as refine_poses
 from accel_calib.statistics import rms
 from accel_calib.table import Poses
-from accel_calib.units import MG, units_of
+from accel_calib.units import MG
 from figures import check, Frame, Line, markdown, share, table, tell
 from generator import again, ON_OUTPUT, simulate, Simulated
 import numpy as np
 from refine_sets import (
     ALIKE, ALONE, Case, cases_of, GROUPS, LOST, NOTHING, ROWS, true_form_error_mg)
 from sensors import simulated_poses
+from shared import MPS2
 
-MS2 = units_of('m/s2')
 BASE = ('offset', 'gain', 'axis_gain', 'cross_axis', 'misalignment')
 EMPIRICAL = 'empirical'
 OUTSIDE_ROWS = ('outside', 'outside60', 'outside200')
@@ -145,10 +145,10 @@ def run_case(case: Case) -> Outcome:
     poses = with_columns(simulated_poses(made), case, 2)
     started = time.process_time()
     try:
-        refined: Any = refine_poses(poses, MS2, base=case.group.base)
+        refined: Any = refine_poses(poses, MPS2, base=case.group.base)
         seconds = time.process_time() - started
         other = again(np.random.default_rng((*case.seed, 1)), made)
-        base = fit_poses(poses, MS2, model=case.group.base)
+        base = fit_poses(poses, MPS2, model=case.group.base)
         fresh = with_columns(simulated_poses(other), case, 3)
         used = base if refined.refusal else refined.calibration
         return Outcome(

@@ -25,7 +25,7 @@ from accel_calib.refinement.linear import SEEN
 from accel_calib.refinement.state import candidates, orthonormal
 from accel_calib.statistics import rms
 from accel_calib.table import Floats, Poses
-from accel_calib.units import MG, units_of
+from accel_calib.units import MG
 from figures import Frame, markdown
 from generator import again, simulate
 import numpy as np
@@ -34,6 +34,7 @@ from refine import BASE, run_case
 from refine_sets import Case, cases_of, PAIRED, true_form_error_mg
 import scipy
 from sensors import simulated_poses
+from shared import MPS2
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, RBF, WhiteKernel
 from sklearn.linear_model import LassoCV
@@ -122,9 +123,8 @@ class Library:
 
 def library_of(poses: Poses, fresh: Poses) -> Library:
     """Return the equations of poses and of others near model 10 of the first ones."""
-    units = units_of('m/s2')
-    model = fit_poses(poses, units, model='10').model
-    tables = [add_history(in_g(each, units), model) for each in (poses, fresh)]
+    model = fit_poses(poses, MPS2, model='10').model
+    tables = [add_history(in_g(each, MPS2), model) for each in (poses, fresh)]
     tried = [*candidates(CATALOGUE, tables[0])]
     sides = []
     for table in tables:
@@ -206,14 +206,6 @@ CHOOSERS: dict[str, Callable[[Library], Floats]] = {
     'STLSQ': choose_by_stlsq}
 
 
-def error_of_process(each: Library) -> float:
-    """Return the error of other poses with a Gaussian process of all that is recorded [g]."""
-    width = each.taken.recorded.shape[1]
-    kernel = ConstantKernel(1.0) * RBF(np.full(width, 2.0), (0.2, 1e4)) + WhiteKernel(1.0, 'fixed')
-    found = GaussianProcessRegressor(kernel).fit(each.taken.recorded, each.taken.residual)
-    return each.fresh.error(found.predict(each.fresh.recorded))
-
-
 Judged = Mapping[str, tuple[bool | None, float]]
 """By way: whether it names exactly the hidden effects, None if it cannot, and error over base."""
 
@@ -233,7 +225,11 @@ def judge_ways(case: Case) -> Judged:
         named = {effect for effect, block in zip(each.effects, each.blocks, strict=True)
                  if np.any(values[block])}
         found[name] = named == set(case.hidden), each.error(values) / base
-    found['Gaussian process'] = None, error_of_process(each) / base
+    kernel = ConstantKernel(1.0) * RBF(np.full(each.taken.recorded.shape[1], 2.0), (0.2, 1e4))
+    process = GaussianProcessRegressor(kernel + WhiteKernel(1.0, 'fixed')).fit(
+        each.taken.recorded, each.taken.residual)  # of all that is recorded
+    found['Gaussian process'] = None, each.fresh.error(
+        process.predict(each.fresh.recorded)) / base
     found['oracle'] = None, (true_form_error_mg(made, other) or np.nan) / MG / base
     return found
 

@@ -24,15 +24,15 @@ from accel_calib.findings import Rating
 from accel_calib.geometry import spread_directions, unit
 from accel_calib.logs import LogOptions, open_log
 from accel_calib.pipeline import calibrated_log, Outcome, poses_of
-from accel_calib.session import columns_of, diagnostics
+from accel_calib.session import diagnostics
 from accel_calib.statistics import rms
 from accel_calib.table import concatenated, Floats
 from bag_files import fill, header, IMU, imu, writer_of
 from driven import Driver
 from figures import Frame, markdown, tell
 import numpy as np
+from shared import GRAVITY as G, rows_of
 
-G = 9.80665
 WRONG_MG = 10.0
 
 OF_SAMPLES = ('missing', 'not_taken', 'signs', 'clock', 'columns', 'limited')
@@ -168,8 +168,7 @@ def calibrate_session(log: Log, units: str, found: tuple[Finding, ...]) -> Said:
     with TemporaryDirectory() as own:
         driver = Driver(units=units or 'm/s2', calibration_file=f'{own}/own.yaml')
         driver.session.change(found=found)
-        context = np.full((len(log.time), len(columns_of(driver.session.state.settings))), np.nan)
-        rows = np.column_stack([*log[:3], context])
+        rows = rows_of(*log[:3])
         for block in np.array_split(rows, max(1, len(rows) // 25)):
             driver.now += 25 * float(np.median(np.diff(log.time)))
             if driver.session.accepts('imu_link'):

@@ -71,10 +71,6 @@ class Sensor:
         """Return the readings of (n, 3) forces."""
         return force @ self.gain.T + self.offset
 
-    def lengths(self, reading: Floats) -> Floats:
-        """Return |force| of (n, 3) readings."""
-        return np.linalg.norm(np.linalg.solve(self.gain, (reading - self.offset).T), axis=0)
-
     def values(self, model: str) -> Floats:
         """
         Return the true values of a model, in the order of `Model.vector`.

@@ -25,13 +25,14 @@ from accel_calib.errors import AccelCalibError
 from accel_calib.geometry import unit
 from accel_calib.logs import read_recording
 from accel_calib.stillness import CaptureSettings, StillDetector
-from accel_calib.table import Floats, numbered, Poses
-from accel_calib.units import units_of
-from figures import check, DATA, Frame, Line, markdown, share, table
+from accel_calib.table import Floats
+from accel_calib.units import UnitName, units_of
+from figures import check, DATA, Frame, Line, markdown, table
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, lfilter
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
+from shared import poses_of, rows_of
 
 KINDS = {'plain': 'turned by hand', 'tremor': 'also held in the hand, tremor of 1 to 10 mg',
          'turning': 'also turned at 0.5 to 5 °/s', 'footsteps': 'steps of 2 to 20 mg beside it',
@@ -40,7 +41,6 @@ NOISES_MG = (0.3, 1.0, 3.0, 5.0)
 NOISY_MG = 50.0
 RATES_HZ = (50.0, 100.0, 200.0, 1000.0)
 CORRELATION_S = (0.0, 0.0, 0.02, 0.2)
-Unit = Literal['m/s2', 'g', 'native']
 
 REST, CARRY, OTHER = 0, 1, 2
 """Phases of a recording."""
@@ -48,7 +48,7 @@ REST, CARRY, OTHER = 0, 1, 2
 GYRO_NOISE, GYRO_BIAS = 2e-3, 1.5e-2
 """Standard deviations of the gyro, of a sample and of its bias by axis [rad/s]."""
 
-RECORDINGS: tuple[tuple[str, Unit, int], ...] = (
+RECORDINGS: tuple[tuple[str, UnitName, int], ...] = (
     ('mpu9150_imu0', 'm/s2', 21), ('mpu9150_imu1', 'm/s2', 21),
     ('xsens_mti_counts', 'native', 38))
 """Name, unit, and the number of poses that the person took."""
@@ -182,8 +182,7 @@ class Pose(NamedTuple):
 def by_detector(case: Case, rate: Floats) -> list[Pose]:
     """Return the dwells that the stillness detector finds with these angular rates."""
     detector = StillDetector(CaptureSettings(), units_of(case.units))
-    context = np.full((len(rate), 2), np.nan)
-    detector.push(np.column_stack([case.time, case.reading, rate, context]))
+    detector.push(rows_of(case.time, case.reading, rate))
     detector.close()
     return [Pose(each.start, each.end, each.mean, each.std / np.sqrt(each.count))
             for each in detector.dwells()]
@@ -338,56 +337,6 @@ def lines_of(found: Scores, noise: str, sets: int) -> Iterator[Line]:
                         least=0.85, most=1.15, sets=sets)
 
 
-# --------------------------------------------------------------- disturbed from the first second
-
-class Disturbance(NamedTuple):
-    """A disturbance from the first second on."""
-
-    what: str
-    kind: str  # swing, an oscillation; or noise that is white or has passed a low-pass: filtered
-    band: tuple[float, float]  # frequencies [Hz]
-    size: tuple[float, float]  # amplitudes or standard deviations [g]
-    least: float = -np.inf  # asked: the share of recordings that is captured [%]
-    most: float = np.inf
-
-
-FIRST = (
-    Disturbance('shaking at 1 to 5 Hz, 20 to 200 mg', 'swing', (1.0, 5.0), (0.02, 0.2), most=0.0),
-    Disturbance('tremor at 8 to 12 Hz, 5 to 50 mg', 'swing', (8.0, 12.0), (5e-3, 0.05)),
-    Disturbance('vibration at 30 to 80 Hz, 20 mg', 'swing', (30.0, 80.0), (0.02, 0.02), 95.0),
-    Disturbance('white noise of 20 to 50 mg', 'white', (0.0, 0.0), (0.02, 0.05), 95.0),
-    Disturbance('noise of 5 to 20 mg, low-pass at 5 to 40 Hz', 'filtered', (5.0, 40.0),
-                (5e-3, 0.02), 95.0))
-
-
-def is_captured(index: int, seed: int, number: int) -> bool:
-    """Return whether a sensor is captured that never rested before."""
-    each, rng = FIRST[index], np.random.default_rng([seed, index, number])
-    rate_hz = float(rng.choice((100.0, 200.0, 1000.0)))
-    count = int(12.0 * rate_hz)
-    force = Rotation.random(random_state=rng).apply([0.0, 0.0, 1.0])
-    frequency, size = rng.uniform(*each.band), np.exp(rng.uniform(*np.log(each.size)))
-    own = rng.normal(size=(2 * count, 3))
-    if each.kind == 'filtered':
-        own = lfilter(*butter(2, frequency, fs=rate_hz), own, axis=0)
-    own = own[count:] * (2e-3 if each.kind == 'swing' else size) / own[count:].std()
-    if each.kind == 'swing':
-        own += draw_swing(rng, count, rate_hz, size, frequency, min(0.05 * frequency, 0.5))
-    samples = np.full((count, 9), np.nan)
-    samples[:, 0], samples[:, 1:4] = np.arange(count) / rate_hz, force + own
-    detector = StillDetector(CaptureSettings(), units_of('g'))
-    detector.push(samples)
-    detector.close()
-    return bool(detector.dwells())
-
-
-def lines_of_first(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
-    """Yield how often a sensor that never rested before is captured, for each disturbance."""
-    for index, (what, *_, least, most) in enumerate(FIRST):
-        yield share(f'{what}: captured', frame.run_sets(is_captured, sets, index, seed),
-                    least=least, most=most)
-
-
 # -------------------------------------------------------------------------------- real recordings
 
 def rows_of_real() -> Iterator[tuple[object, ...]]:
@@ -403,30 +352,25 @@ def rows_of_real() -> Iterator[tuple[object, ...]]:
         for rule, find in RULES.items():
             poses = find(case)
             used = sum((time >= each.start) & (time <= each.end) for each in poses)
-            yield (name, rule, len(poses), wanted, f'{np.mean(used):.1%}',
-                   *fit_words(poses, case.units))
-
-
-def fit_words(poses: Sequence[Pose], unit_name: Literal['g', 'native']) -> tuple[str, str]:
-    """Return residual [mg] and chi² per degree of freedom of a fit, in words."""
-    if not poses:
-        return 'no poses', ''
-    start, _, mean, noise = map(np.array, zip(*poses))
-    columns = {'time': start, 'reading': mean, 'std': noise, 'count': np.ones(len(poses))}
-    try:
-        quality = fit_poses(Poses(columns, numbered(columns)), units_of(unit_name), model='10',
-                            method='algebraic').quality
-    except AccelCalibError as error:
-        return f'no fit ({type(error).__name__})', ''
-    chi2 = quality.chi2_per_dof
-    return f'{quality.rms_after_mg:.3f}', '' if chi2 is None else f'{chi2:.1f}'
+            row = [name, rule, len(poses), wanted, f'{np.mean(used):.1%}']
+            if not poses:
+                yield *row, 'no poses', ''
+                continue
+            start, _, mean, noise = map(np.array, zip(*poses))
+            try:
+                quality = fit_poses(
+                    poses_of(mean, time=start, std=noise, count=np.ones(len(poses))),
+                    units_of(case.units), model='10', method='algebraic').quality
+                chi2 = quality.chi2_per_dof
+                yield *row, f'{quality.rms_after_mg:.3f}', '' if chi2 is None else f'{chi2:.1f}'
+            except AccelCalibError as error:
+                yield *row, f'no fit ({type(error).__name__})', ''
 
 
 def stillness(frame: Frame, sets: int = 60, seed: int = 1) -> Iterator[str]:
     usual, noisy = (measure(frame, sets, seed, each) for each in (False, True))
     yield table([*lines_of(usual, 'noise 0.3 to 5 mg', sets),
                  *lines_of(noisy, 'noise 50 mg', sets)])
-    yield table(lines_of_first(frame, sets, seed))
     yield compare_rules(usual)
     yield compare_rules(noisy)
     yield markdown(('recording', 'rule', 'poses', 'taken by hand', 'samples used', 'residual, mg',

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Trust in a fit: outliers, stated uncertainty, choice of the model, and the rating.
+Trust in a fit: stated uncertainty, choice of the model, and the rating.
 
 The sensors, their effects and the true error are computed without the models and the simulation of
 the package.
@@ -22,12 +22,7 @@ from accel_calib.units import MG, units_of
 from figures import check, Frame, Line, markdown, share, table
 import numpy as np
 from sensors import Case, draw_case, draw_sensor, length_error_mg, NOISES, SAMPLES, Sensor, spread
-from shared import changed, FACES, G, poses_of, random_directions
-
-# ------------------------------------------------------------------------------------- robustness
-
-KNOCK, SHOWS_MG = 0.05, 2.0
-"""Size of a knock [g], and change of |force| from which it must be detected [mg]."""
+from shared import FACES, G, poses_of, random_directions
 
 
 def fit(case: Case, model: str = 'auto') -> Calibration | None:
@@ -36,59 +31,6 @@ def fit(case: Case, model: str = 'auto') -> Calibration | None:
         return fit_poses(case.poses, G, model=model)
     except AccelCalibError:
         return None
-
-
-def error_mg(found: Calibration | None, case: Case, rng: np.random.Generator) -> float:
-    """Return the RMS error of |a| on fresh directions [mg]; infinite if the fit was refused."""
-    if found is None:
-        return np.inf
-    return length_error_mg(found.correct(case.sensor.reading(random_directions(300, rng))))
-
-
-def knocks_of(count: int, knocked: int, measured: bool, seed: int
-              ) -> tuple[float, bool, bool, float]:
-    """
-    Fit a set with knocked poses.
-
-    Returns
-    -------
-    float, bool, bool, float
-        Error [mg]; whether exactly the knocked poses are rejected, those that show little aside;
-        whether a clean pose is rejected; error of a fit to the clean poses [mg].
-
-    """
-    rng = np.random.default_rng([seed, count, knocked])
-    sensor, clean, _ = case = draw_case(rng, count)
-    rows = rng.choice(count, knocked, replace=False) if knocked else np.zeros(0, int)
-    poses = changed(clean, rows, plus=KNOCK * random_directions(knocked, rng))
-    kept = set(range(count)) - set(rows.tolist())
-    shows = np.abs(sensor.lengths(poses.reading) - sensor.lengths(clean.reading)) * MG
-    best = fit(case._replace(poses=poses.take(sorted(kept))), '10')
-    found = fit(case._replace(
-        poses=poses if measured else poses.without_columns('std', 'count')), '10')
-    named = set() if found is None else {rejected.row - 1 for rejected in found.rejected}
-    lost = bool(named & kept)
-    right = found is not None and set(np.flatnonzero(shows >= SHOWS_MG)) <= named and not lost
-    return error_mg(found, case, rng), right, lost, error_mg(best, case, rng)
-
-
-def knocks(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
-    """Yield the lines of clean and knocked sets."""
-    asked = {(12, 0): 0.27, (36, 0): 0.148, (1000, 0): 0.029, (12, 1): 0.33, (36, 3): 0.165}
-    for (count, knocked), most in asked.items():
-        for measured in (True, False):
-            error, named, lost, best = map(np.array, zip(*frame.run_sets(
-                knocks_of, sets, count, knocked, measured, first=seed)))
-            what = f'{count} poses, ' + (f'{knocked} knocked by 50 mg' if knocked else 'clean')
-            what += '' if measured else ', noise not given'
-            middle = float(np.median(error))
-            yield check(f'{what}: error [mg] (of a fit to the right rows)',
-                        f'{middle:.3f} ({np.median(best):.3f})', middle, most=most, sets=sets)
-            if knocked:
-                yield share(f'{what}: each that shows by {SHOWS_MG:g} mg rejected, no clean one',
-                            named, least=95.0)
-            else:
-                yield share(f'{what}: no pose rejected', ~lost, least=98.0)
 
 
 def interval_of(kind: str, model: str, count: int, noise: str, seed: int
@@ -134,12 +76,15 @@ def intervals(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
 
 
 def choice_of(kind: str, count: int, seed: int) -> dict[str, float]:
-    """Return the errors of auto and of each fixed model [mg]."""
-    rng = np.random.default_rng([seed, count, int(kind)])
+    """Return the errors of |a| with auto and each fixed model [mg]; infinite if it is refused."""
+    rng, errors = np.random.default_rng([seed, count, int(kind)]), {}
     case = draw_case(rng, count, kind)
-    fresh = rng.integers(2 ** 32)
-    return {model: error_mg(fit(case, model), case, np.random.default_rng(fresh))
-            for model in ('auto', '4', '7', '10')}
+    reading = case.sensor.reading(random_directions(300, np.random.default_rng(
+        rng.integers(2 ** 32))))
+    for model in ('auto', '4', '7', '10'):
+        found = fit(case, model)
+        errors[model] = np.inf if found is None else length_error_mg(found.correct(reading))
+    return errors
 
 
 def choices(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
@@ -155,12 +100,8 @@ def choices(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
                         f'{best})', ratio, most=1.05, sets=2 * sets)
 
 
-ROWS = {'knocks': knocks, 'intervals': intervals, 'choices': choices}
-
-
-def robustness(frame: Frame, sets: int = 200, seed: int = 1, only: tuple[str, ...] = tuple(ROWS)
-               ) -> Iterator[str]:
-    yield table(line for name in only for line in ROWS[name](frame, sets, 100_000 * seed))
+def robustness(frame: Frame, sets: int = 200, seed: int = 1) -> Iterator[str]:
+    yield table([*intervals(frame, sets, 100_000 * seed), *choices(frame, sets, 100_000 * seed)])
 
 
 # ----------------------------------------------------------------------------------------- rating
@@ -168,8 +109,6 @@ def robustness(frame: Frame, sets: int = 200, seed: int = 1, only: tuple[str, ..
 NEW = 2000
 COUNTS = 16384.0
 """Counts per g of the sets in native units."""
-
-Reading = Callable[[Floats, Floats], Floats]
 
 NAMES = ('GOOD', 'USABLE', 'BAD', 'refused')
 
@@ -241,7 +180,7 @@ def draw_directions(kind: Kind, rng: np.random.Generator) -> Floats:
     return up[up[:, 2] >= {'half': 0.0, 'bunched': 0.5}[kind.poses]][:kind.count]
 
 
-def draw_set(kind: Kind, rng: np.random.Generator) -> tuple[Poses, Floats, Reading]:
+def draw_set(kind: Kind, rng: np.random.Generator) -> tuple[Poses, Floats, Callable[..., Floats]]:
     """
     Draw a sensor and measure its poses.
 
