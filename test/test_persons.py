@@ -435,7 +435,7 @@ def test_an_offer_that_is_discarded_names_what_is_in_use() -> None:
     Person(driver, healthy).rest([0.0, 0.0, 1.0], 4.0)
     for saves, words in ((False, 'there is no other one'), (True, 'the one in use is unchanged')):
         driver.ask('calibrate_at_rest')
-        assert enable(driver.session, True).endswith('call ~/save to use the one that waits')
+        assert 'call ~/save to use and store it' in enable(driver.session, True)
         if saves:
             driver.ask('save')
             driver.ask('set_level')
