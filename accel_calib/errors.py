@@ -81,15 +81,14 @@ def needing(libraries: str, what: str) -> Iterator[None]:
 
 
 class RefusedFitError(AccelCalibError):
-    """The poses do not determine the model, or the result is not plausible."""
+    """
+    The poses do not determine the model, or the result is not plausible.
 
+    Where more poses are the only remedy, `offer` is what is possible without them, or ''.
 
-class TooFewPosesError(RefusedFitError):
-    """The poses do not determine the model; `advice` asks for others, and `offer` is possible."""
+    """
 
-    def __init__(self, message: str, advice: str, offer: str = '') -> None:
-        super().__init__(message, advice + offer)
-        self.offer = offer
+    offer: str | None = None
 
 
 class StoredCalibrationError(AccelCalibError):

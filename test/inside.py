@@ -85,7 +85,7 @@ from accel_calib.session.poses import Guide, LiveCapture
 from accel_calib.session.settings import changed
 from accel_calib.session.state import new_sensor
 from accel_calib.session.store import aside, SensorFiles, Store as SensorStore, store_of
-from accel_calib.session.stream import StreamStatistics, TemperatureHistory
+from accel_calib.session.stream import StreamStatistics
 from accel_calib.session.use import adopt as use_calibration, fit as fit_in_node
 from accel_calib.session.worker import Worker, WorkerProcess
 from accel_calib.stillness import rest_after, rounding_left, with_temperature

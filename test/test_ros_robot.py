@@ -265,7 +265,7 @@ def test_the_managed_node_loads_and_has_a_page_on_configure_and_publishes_when_a
         bench.spin(lambda: publisher.get_subscription_count() > 0)
         assert set_all() == [False] * 4
         assert pushes() == 0
-        assert 'but not activated, nothing is published' in bench.call('enable', data=True).message
+        assert 'not activated, nothing is published' in bench.call('enable', data=True).message
         bench.go(Transition.TRANSITION_ACTIVATE)
         bench.spin(lambda viewer=viewer: pushes() > 0 and any(
             each['length'] for each in viewer.of('progress')))

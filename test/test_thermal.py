@@ -3,12 +3,11 @@
 
 """Lag and rate of the temperature: known solutions, wavy temperatures, streams."""
 
-from accel_calib.effects import add_history
+from accel_calib.effects import add_history, TemperatureHistory
 from accel_calib.errors import InputError
 from accel_calib.estimate import estimate
 from inside import (
-    acting_temperature, Lag, low_passed, Model, predict, rate_of, simulate_poses,
-    TemperatureHistory, ThermalStream)
+    acting_temperature, Lag, low_passed, Model, predict, rate_of, simulate_poses, ThermalStream)
 import numpy as np
 import pytest
 from shared import random_directions, rms, SENSOR

@@ -50,7 +50,7 @@ from .directions import (
     determines, dilution, dilution_of, directions_of, error_left_in, ideal_of, identifiability,
     information_of, NORM_MODELS, poses_needed, rows_of, shape_words, WEAK_DILUTION)
 from ..effects import EffectKey, entry_of, Model
-from ..errors import RefusedFitError, TooFewPosesError
+from ..errors import RefusedFitError
 from ..estimate import Fit, fit_sphere, judge, kinds, pose_noise
 from ..finding import Finding
 from ..geometry import (
@@ -300,11 +300,13 @@ def refuse_if_unfit(name: str, directions: Floats, noise: Floats | None = None) 
     # Several that are open together say less than the poses that are missing.
     alone = [] if few else [next(iter(each.main)) for each in identifiability(
         name, directions, noise).undetermined if len(each.main) == 1]
-    raise TooFewPosesError(
+    error = RefusedFitError(
         f'{shape_words(name, directions)}, expected at least {poses_needed(name)} poses spread '
         f'over the sphere for model {name}'
         f'{f"; not determined: {enumerated(alone)}" if alone else ""}',
-        f'{turn_words(missing_poses(name, directions, noise))}, hold it still and continue', offer)
+        f'{turn_words(missing_poses(name, directions, noise))}, hold it still and continue{offer}')
+    error.offer = offer
+    raise error
 
 
 def find_undetermined(chosen: str, directions: Floats, noise: Floats | None = None

@@ -40,7 +40,9 @@ from .catalogue import (
 from .form import (
     AFFINE, AXES, by_axis, Context, CUBE, Effect, EffectKey, EffectRecord, fitted_places, FORCE,
     MONOMIALS, ODD_SQUARE, ONE, PRODUCT, SIZE, SQUARE, TO_SEPARATE, WAVE, ZONAL, ZONES)
-from .history import add_acting, add_history, context_of_samples, FROM_TEMPERATURE, thermal_stream
+from .history import (
+    add_acting, add_history, context_of_samples, FROM_TEMPERATURE, TemperatureHistory,
+    thermal_stream)
 from .model import (
     check_context, CONVERGED_G, correct, EachShape, factors_of, LARGEST_FORCE_G,
     LARGEST_ITERATIONS, length_rows, linear_model, Model, own_slope, predict, sensor_force,

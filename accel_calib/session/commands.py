@@ -29,8 +29,7 @@ from .worker import Compute, Files, nothing, Parse, Part, Task
 from ..calibration import (
     Calibration, fit_partial, gyro_bias_of_rest, level, mounting_only, set_heading as with_heading)
 from ..effects import Model
-from ..errors import (
-    AccelCalibError, InputError, RefusedFitError, StoredCalibrationError, TooFewPosesError)
+from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
 from ..findings import angle_words, difference_words
 from ..pipeline import is_partial, is_refined
 from ..stillness import Dwell, poses_from
@@ -162,13 +161,12 @@ def _compute(session: Holder, function: Callable[..., Fitted], **given: Any) -> 
         count = len(sensor.live.poses())
         found = yield Compute(function, poses, units=state.units, sensor=state.name,
                               before=sensor.present, **given)
-    except TooFewPosesError as error:
-        session.refuse('poses', error.message)
-        advice = f'{_asked(session, error.advice)}{error.offer}'
-        raise RefusedFitError(error.message, advice) from None
     except RefusedFitError as error:
-        session.refuse('poses', error.advice)
-        raise
+        session.refuse('poses', error.advice if error.offer is None else error.message)
+        if error.offer is not None:
+            error = RefusedFitError(
+                error.message, f'{_asked(session, error.advice)}{error.offer}')
+        raise error from None
     finally:
         session.change(computing=session.state.computing - 1)
     if session.sensor.live is not sensor.live or session.sensor.changes != sensor.changes:
@@ -391,17 +389,10 @@ COMMANDS: dict[str, Callable[[Holder], Any]] = {each.__name__: each for each in 
 def enable(session: Holder, on: bool) -> str:
     """Switch the correction on or off."""
     session.change(enabled=on)
-    if session.state.files.problem or not session.state.is_active:
-        return f'the correction is {"on" if on else "off"}, but {words_of_state(session.state)}'
-    if not on:
-        return 'the correction is off: raw messages are published unchanged'
-    if session.sensor.calibration is None:
-        published = 'raw messages are' if session.state.settings.passthrough else 'nothing is'
-        step = 'capture poses and call ~/fit' if session.sensor.offered is None else (
-            'call ~/save to use the one that waits')
-        return (f'the correction is on, but there is no calibration yet: {published} published; '
-                f'{step}')
-    return 'the correction is on: corrected messages are published'
+    words = words_of_state(session.state)
+    if on and session.sensor.calibration is None:
+        words += next_words(session.state)
+    return f'correction on: {words}' if on else words
 
 
 BUTTONS: dict[str, Callable[[Holder], Any]] = {

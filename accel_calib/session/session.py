@@ -162,20 +162,19 @@ class Session(Holder):
             elif not self.state.settings.sensor:
                 self._find_store()
             return True
-        is_replaced = self.state.statistics.age > SILENT
-        if is_replaced:
-            self.log('warning', f'the messages now have frame_id {frame_id!r} instead of '
-                     f'{self.state.frame_id!r}: switching to this sensor')
         self._change(self.sensor.live.interrupt(self.state.settings.auto_capture))
-        if is_replaced:
-            self.change(frame_id=frame_id)
-            if not self.state.settings.sensor:  # otherwise the user has set the sensor
-                self._begin(self.events.append)
-            self._show_frame()
-            return True
-        self.drop('foreign', 'error', f'an Imu message has frame_id {frame_id!r}, expected '
-                  f'{self.state.frame_id!r}; it is dropped: use a separate topic for each sensor')
-        return False
+        if self.state.statistics.age <= SILENT:
+            self.drop('foreign', 'error', f'an Imu message has frame_id {frame_id!r}, expected '
+                      f'{self.state.frame_id!r}; it is dropped: use a separate topic for each '
+                      'sensor')
+            return False
+        self.log('warning', f'the messages now have frame_id {frame_id!r} instead of '
+                 f'{self.state.frame_id!r}: switching to this sensor')
+        self.change(frame_id=frame_id)
+        if not self.state.settings.sensor:  # otherwise the user has set the sensor
+            self._begin(self.events.append)
+        self._show_frame()
+        return True
 
     def push(self, samples: Floats, arrived: float) -> None:
         """

@@ -27,12 +27,12 @@ import numpy as np
 from .poses import Guide, LiveCapture, LONG_REST
 from .settings import CalibratorSettings, capture_settings, columns_of
 from .store import SensorFiles
-from .stream import Around, StreamStatistics, TemperatureHistory
+from .stream import Around, StreamStatistics
 from ..calibration import (
     Calibration, gyro_bias_of_rest, GyroBias, on_topics, Outside, outside, SampleNoise,
     with_given_mounting)
 from ..comparison import compared, Drift, rest_errors
-from ..effects import Context, OwnEffect
+from ..effects import Context, OwnEffect, TemperatureHistory
 from ..errors import InputError
 from ..finding import Finding
 from ..findings import mounting_words, Rating

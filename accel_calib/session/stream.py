@@ -10,16 +10,12 @@ is played at another speed. They cover the last `_SPAN` seconds.
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
-from copy import deepcopy
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from .poses import LONG_REST
-from ..effects import Context, Model, thermal_stream, ThermalStream
 from ..table import Floats
 
 _SPAN = 5.0
@@ -246,96 +242,3 @@ class Around:
         """Return whether nothing has arrived for too long."""
         limit = HELD if column in self._came else AGAIN
         return self._clock() - self._came.get(column, self._begun) > limit
-
-
-_APART = 2.0
-"""Shortest time between two temperatures of the history [s]."""
-
-_POINTS = 3600
-"""Largest number of temperatures of the history: two hours, many times a common lag."""
-
-_RECENT = int(2.0 * LONG_REST / _APART)
-"""Number of recent points whose columns are kept; they cover the longest rest."""
-
-
-@dataclass(frozen=True, eq=False)
-class TemperatureHistory:
-    """
-    Temperatures of the last hours, and the columns that a model needs from them.
-
-    A calibration that changes while the node runs thus starts with the lag that the sensor has.
-
-    Parameters
-    ----------
-    points : deque of (float, float)
-        Times and temperatures.
-    followed : dict
-        By what a model needs: its stream, and the columns at the recent points. Models that are
-        asked for are followed.
-
-    """
-
-    points: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_POINTS))
-    followed: dict[object, tuple[ThermalStream, deque[tuple[float, Any]]]] = field(
-        default_factory=dict)
-
-    def add(self, time: Floats, temperature: Floats) -> None:
-        """
-        Add samples; a temperature that is NaN is ignored.
-
-        The points do not depend on how the samples are divided into calls: of a recording that is
-        played fast, a call may have the samples of many seconds.
-
-        """
-        known = np.isfinite(time + temperature)
-        if not np.any(known):
-            return
-        time, temperature = time[known], temperature[known]
-        if self.points and time[-1] < self.points[-1][0]:  # the stream starts again
-            self.points.clear()
-            for _, columns in self.followed.values():
-                columns.clear()
-        back = np.flatnonzero(np.diff(time) < -_APART)
-        begin = int(back[-1]) + 1 if len(back) else 0
-        while begin < len(time):
-            due = self.points[-1][0] + _APART if self.points else -np.inf
-            later = np.flatnonzero(time[begin:] >= due)
-            end = begin + int(later[0]) + 1 if len(later) else len(time)
-            now = float(time[end - 1])
-            if len(later):
-                self.points.append((now, float(temperature[end - 1])))
-            for stream, columns in self.followed.values():
-                stream.add_all(time[begin:end], temperature[begin:end])
-                columns.extend([(now, stream.value)] if len(later) else [])
-            begin = end
-
-    def columns_of(self, model: Model) -> Mapping[str, float]:
-        """Return the present columns of a model."""
-        stream, _ = self._follow(model)
-        return {} if stream is None else stream.value
-
-    def stream(self, model: Model) -> ThermalStream | None:
-        """Return the lag and rate for a model after this history; None if it needs none."""
-        return deepcopy(self._follow(model)[0])
-
-    def during(self, model: Model, start: float, end: float) -> Context:
-        """Return the mean columns that a model needs between two times; empty if not known."""
-        _, columns = self._follow(model)
-        inside = [each for time, each in columns if start - _APART <= time <= end]
-        if not inside:
-            return {}
-        return {key: np.array([np.mean([each[key] for each in inside])]) for key in inside[0]}
-
-    def _follow(self, model: Model) -> tuple[ThermalStream | None, Iterable[tuple[float, Any]]]:
-        """Return the stream of a model, which is followed from now on, and its recent columns."""
-        key, stream = (tuple(model.lags.items()), 'temperature_rate' in model.over), (
-            thermal_stream(model))
-        if stream is None:
-            return None, ()
-        if key not in self.followed:
-            columns = deque[tuple[float, Any]](maxlen=_RECENT)
-            for time, temperature in self.points:
-                stream.add(time, temperature)
-                columns.append((time, stream.value))
-            self.followed[key] = stream, columns
-        return self.followed[key]

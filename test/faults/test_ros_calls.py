@@ -81,4 +81,5 @@ def test_each_call_of_enable_is_answered_while_messages_arrive(
         sent = [client.call_async(SetBool.Request(data=bool(k % 2))) for k in range(AT_ONCE)]
         bench.spin(lambda sent=sent: all(each.done() for each in sent))
         words = [each.result().message for each in sent]
-        assert all(f'correction is {("off", "on")[k % 2]}' in each for k, each in enumerate(words))
+        assert all(f'correction {("switched off", "on")[k % 2]}' in each
+                   for k, each in enumerate(words))
