@@ -500,8 +500,8 @@ def _asked(given: Source | Poses | Recording | Data, units: UnitName | None,
     elif hasattr(given, 'columns') and not isinstance(given, Table):
         source = Frame(given)
     elif not isinstance(given, Table):
-        columns = {'reading': np.ma.asarray(given, float).filled(np.nan)}
-        shape = columns['reading'].shape
+        reading: Floats = np.ma.asarray(given, float).filled(np.nan)
+        columns, shape = {'reading': reading}, reading.shape
         if len(shape) != 2 or shape[1] != 3:
             raise InputError(f'the array has shape {shape}, expected (n, 3) readings',
                              'pass such an array, a table or a DataFrame')
