@@ -546,8 +546,8 @@ def _decide_context(made: Quantities, first: Cells) -> None:
             if _LIKELY_TEMPERATURE_C[0] <= middle <= _LIKELY_TEMPERATURE_C[1]:
                 made.said += [] if own else [f'{name} in °C (assumed)']
             else:
-                _leave_out(made, key, f'the temperature {name} has values of about {middle:.4g} '
-                           'in a unit that is not known, and is',
+                _leave_out(made, key, f'the temperature in column {name} has values of about '
+                           f'{middle:.4g} in a unit that is not known, and is',
                            'state its unit in the name, such as temperature_K')
     names = [name for name in layout.header[:MOST]
              if meaning(name).quantity == 'temperature']

@@ -246,13 +246,14 @@ def search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...] = (), step: 
     found = _search(poses_g, base, also)
     again = _with_own_noise if 'new' in poses_g else _with_scatter
     found = again(found, poses_g, base, also)
-    fit, noise = judge(found.final.model, poses_g), poses_g.noise
-    change = step / np.sqrt(12.0) * np.abs(slope_of_temperature(fit))
-    if noise is not None and np.any(change) and not found.final.is_noise:
+    if step and (noise := poses_g.noise) is not None and not found.final.is_noise:
         # A walk, a curve or an effect could describe what the steps leave, alike in neighbours.
-        share = (found.final.rss / found.final.dof - 1.0) / float(np.mean((change / noise) ** 2))
-        scatter = change * np.sqrt(min(share, 1.0))
-        found = _beside(poses_g.with_columns(own_scatter=scatter), base, also)
+        slope = slope_of_temperature(judge(found.final.model, poses_g))
+        change = step / np.sqrt(12.0) * np.abs(slope)
+        if np.any(change):
+            share = (found.final.rss / found.final.dof - 1.0) / np.mean((change / noise) ** 2)
+            scatter = change * np.sqrt(min(float(share), 1.0))
+            found = _beside(poses_g.with_columns(own_scatter=scatter), base, also)
     return replace(found, base=_weighted(found.base), final=_weighted(found.final),
                    outliers=everyone[found.outliers], clipped=clip, grid_g=grid,
                    with_clipped=whole, also=also)
