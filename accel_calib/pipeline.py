@@ -548,7 +548,7 @@ class Correction:
         """Return the context of the next block, as the effects need it."""
         model = self.calibration.model
         known = {key: values for key, values in samples.columns.items()
-                 if key not in CONTEXT or not np.any(np.isnan(values))}
+                 if key not in CONTEXT or len(values) == 0 or not np.isnan(values).all()}
         found = context_of_samples(known, len(samples), model, self._thermal)
         self._lacking = ''
         if lacking := [key for key in model.neutral if key not in samples]:
