@@ -36,7 +36,7 @@ DATA = ROOT.parent / 'shared' / 'data'
 
 MODULES = {page: module for module, pages in (
     ('changes', ('compare', 'watching')), ('poses', ('geometry', 'next_pose', 'plans')),
-    ('speed', ('fits', 'refine_cost', 'recordings', 'memory')),
+    ('speed', ('fits', 'recordings', 'memory')), ('refine', ('refine_cost',)),
     ('trust', ('rating', 'robustness'))) for page in pages}
 """Modules of pages with another name."""
 
@@ -201,7 +201,7 @@ def main() -> None:
         parts = list(page(Frame(pool), **given))
     text = update(file.read_text(encoding='utf-8'), parts)
     text = re.sub(r'(Made by\s)`[^`]*`', lambda found: f'{found[1]}`{command}`', text)
-    text = re.sub(r'(Machine: |` on |^)[^,\n]+, \d+ cores, load .*?numpy [\d.]*\d',
+    text = re.sub(r'(Machine: |` on |^(?!Made))[^,\n]+, \d+ cores, load .*?numpy [\d.]*\d',
                   lambda found: found[1] + about, text, flags=re.MULTILINE)
     text = re.sub(r'(Measured at the commit )[^\n]*', rf'\g<1>{commit()}.', text)
     print(text)

@@ -27,8 +27,8 @@ from accel_calib.refinement import refine as refine_poses
 from accel_calib.statistics import rms
 from accel_calib.table import Poses
 from accel_calib.units import MG
-from figures import check, Frame, Line, markdown, share, table, tell
-from generator import again, ON_OUTPUT, simulate, Simulated
+from figures import check, Frame, Line, markdown, measure_alone, share, table, tell
+from generator import again, ON_OUTPUT, Setup, simulate, Simulated
 import numpy as np
 from refine_sets import (
     ALIKE, ALONE, Case, cases_of, GROUPS, LOST, NOTHING, ROWS, true_form_error_mg)
@@ -473,3 +473,39 @@ def refine(frame: Frame, sets: int = 20, seed: int = 1, only: tuple[str, ...] = 
                     'clean poses left out', 'parameters inside 3 sd',
                     'held-out residual over true form', 'located', 'fresh over base',
                     'fresh over noise', 'instead'), rows_of_effects(everything))
+
+
+# ------------------------------------------------------------------------------------- many poses
+
+HIDDEN = ('', 'offset_temperature', 'offset_wander', 'quadratic', 'ripple')
+MOST_MS, MOST_MB = 2.0, 200.0
+"""Asked: the longest time per pose [ms], and the largest memory [MB]."""
+
+
+def simulate_many(hidden: str, count: int, seed: int) -> Poses:
+    """Simulate many poses, in which an effect may be hidden."""
+    return simulated_poses(simulate(np.random.default_rng(seed), {hidden: 3.0} if hidden else {},
+                                    Setup(poses=count, samples=20)))
+
+
+def refine_many(poses: Poses) -> str:
+    """Refine poses, and return the result in words."""
+    found = refine_poses(poses, MPS2, base='10')
+    names = ' + '.join(str(step.effect) for step in found.steps) or 'nothing'
+    return f'{names}, {found.verdict}'
+
+
+def refine_cost(frame: Frame, seed: int = 2028, poses: tuple[int, ...] = (5_000, 50_000)
+                ) -> Iterator[str]:
+    """Yield the page of refinements with many poses."""
+    lines = []
+    for count in poses:
+        for hidden in HIDDEN:
+            found = measure_alone(refine_many, hidden, count, seed, prepare=simulate_many)
+            what = f'{count:,} poses, {hidden or "nothing"} hidden'
+            lines += [
+                check(f'{what}: seconds ({found.result})', f'{found.seconds:.1f}', found.seconds,
+                      most=1e-3 * MOST_MS * count),
+                check(f'{what}: largest memory [MB] ({found.before:.0f} before)',
+                      f'{found.megabytes:.0f}', found.megabytes, most=MOST_MB)]
+    yield table(lines)

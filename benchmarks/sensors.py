@@ -71,6 +71,22 @@ class Sensor:
         """Return the readings of (n, 3) forces."""
         return force @ self.gain.T + self.offset
 
+    def lengths(self, reading: Floats) -> Floats:
+        """Return |force| of (n, 3) readings."""
+        return np.linalg.norm(np.linalg.solve(self.gain, (reading - self.offset).T), axis=0)
+
+    def length_slopes(self, force: Floats) -> Floats:
+        """
+        Return the (n, 9) derivative of |force| by the values of model 10, at true forces of 1 g.
+
+        With a = û W⁻¹ the derivative by V_i is -a_i, and that by W_ij is -a_i u_j.
+
+        """
+        a = force @ np.linalg.inv(self.gain)
+        cross = [a[:, i] * force[:, j] + a[:, j] * force[:, i]
+                 for i, j in ((0, 1), (0, 2), (1, 2))]
+        return -np.column_stack([a, a * force, *cross])
+
     def values(self, model: str) -> Floats:
         """
         Return the true values of a model, in the order of `Model.vector`.
@@ -94,6 +110,7 @@ class Case(NamedTuple):
     sensor: Sensor
     poses: Poses  # in g
     force: Floats  # (n, 3) true specific force of each pose [g]
+    noise: Floats  # (n, 1) true standard deviation of each pose, by axis, with its scatter [g]
 
 
 def draw_sensor(rng: np.random.Generator, kind: str = '10') -> Sensor:
@@ -119,10 +136,10 @@ def draw_case(rng: np.random.Generator, count: int, kind: str = '10', noise: str
         each /= QUIET
     sensor, force = draw_sensor(rng, kind), spread(count, rng)
     measured = np.sqrt(rng.chisquare(SAMPLES - 1, size=(count, 3)) / (SAMPLES - 1))
-    scatter = np.hypot(each, NOISE if noise == 'scatter' else 0.0) * rng.normal(size=(count, 3))
+    true = np.hypot(each, NOISE if noise == 'scatter' else 0.0)
     stated = each / 3.0 if noise == 'understated' else each
-    poses = poses_of(sensor.reading(force) + scatter, std=stated * np.sqrt(SAMPLES) * measured,
-                     count=np.full(count, SAMPLES))
+    poses = poses_of(sensor.reading(force) + true * rng.normal(size=(count, 3)),
+                     std=stated * np.sqrt(SAMPLES) * measured, count=np.full(count, SAMPLES))
     if noise == 'not given':
         poses = poses.without_columns('std', 'count')
-    return Case(sensor, poses, force)
+    return Case(sensor, poses, force, true)

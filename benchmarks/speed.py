@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Time and memory of fits, refinements with many poses, recordings and commands."""
+"""Time and memory of fits, recordings and commands."""
 
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stdout
@@ -24,17 +24,15 @@ from accel_calib.estimate import closed_form
 from accel_calib.geometry import spread_directions
 from accel_calib.logs import open_log, read_recording
 from accel_calib.messages import correct_bag
-from accel_calib.refinement import refine
 from accel_calib.stillness import capture
 from accel_calib.stored import read_calibration
-from accel_calib.table import Floats, Poses
+from accel_calib.table import Floats
 from bag_files import write_bag
 from figures import check, DATA, Frame, Line, measure_alone, Measured, ROOT, table, tell
-from generator import Setup, simulate
 import numpy as np
 from rosbags.highlevel import AnyReader
 from scipy.optimize import least_squares
-from sensors import draw_case, draw_sensor, NOISE, simulated_poses, spread
+from sensors import draw_case, draw_sensor, NOISE, spread
 from shared import G, KNOWN, MPS2, NATIVE
 
 SEED = 2031
@@ -111,43 +109,6 @@ def fits(frame: Frame, largest: int = 1_000_000) -> Iterator[str]:
         lines += [Line(f'{name}: time of {size:,} poses [s]', f'{seconds:.3g}')
                   for size, seconds in zip(sizes[-3:], took[-3:], strict=True)]
         lines.append(check(f'{name}: exponent of this time', f'{slope:.2f}', slope, most=1.1))
-    yield table(lines)
-
-
-# ----------------------------------------------------------------------------------- refinements
-
-HIDDEN = ('', 'offset_temperature', 'offset_wander', 'quadratic', 'ripple')
-MOST_MS, MOST_MB = 2.0, 100.0
-"""Asked: the longest time per pose [ms], and the largest memory beyond the imports [MB]."""
-
-
-def simulate_many(hidden: str, count: int, seed: int) -> Poses:
-    """Simulate many poses, in which an effect may be hidden."""
-    return simulated_poses(simulate(np.random.default_rng(seed), {hidden: 3.0} if hidden else {},
-                                    Setup(poses=count, samples=20)))
-
-
-def refine_many(poses: Poses) -> str:
-    """Refine poses, and return the result in words."""
-    found = refine(poses, MPS2, base='10')
-    names = ' + '.join(str(step.effect) for step in found.steps) or 'nothing'
-    return f'{names}, {found.verdict}'
-
-
-def refine_cost(frame: Frame, seed: int = 2028, poses: tuple[int, ...] = (5_000, 50_000)
-                ) -> Iterator[str]:
-    """Yield the page of refinements with many poses."""
-    lines = []
-    for count in poses:
-        for hidden in HIDDEN:
-            found = measure_alone(refine_many, hidden, count, seed, prepare=simulate_many)
-            what = f'{count:,} poses, {hidden or "nothing"} hidden'
-            lines += [
-                check(f'{what}: seconds ({found.result})', f'{found.seconds:.1f}', found.seconds,
-                      most=1e-3 * MOST_MS * count),
-                check(f'{what}: largest memory beyond that of imports and poses [MB]',
-                      f'{found.megabytes - found.before:.0f}', found.megabytes - found.before,
-                      most=MOST_MB)]
     yield table(lines)
 
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Trust in a fit: stated uncertainty, choice of the model, and the rating.
+Trust in a fit: outliers, stated uncertainty, choice of the model, and the rating.
 
 The sensors, their effects and the true error are computed without the models and the simulation of
 the package.
@@ -17,6 +17,7 @@ from accel_calib.errors import AccelCalibError
 from accel_calib.findings import Expected, GOOD_MG, rate, Rating
 from accel_calib.geometry import unit
 from accel_calib.refinement import refine
+from accel_calib.statistics import rms
 from accel_calib.table import Floats, Poses
 from accel_calib.units import MG, units_of
 from figures import check, Frame, Line, markdown, share, table
@@ -31,6 +32,79 @@ def fit(case: Case, model: str = 'auto') -> Calibration | None:
         return fit_poses(case.poses, G, model=model)
     except AccelCalibError:
         return None
+
+
+SHOWS_MG = 2.0
+"""Change of |force| from which a knock must be detected [mg]."""
+
+MOST_MG = {(12, 0): 0.27, (36, 0): 0.148, (1000, 0): 0.029, (12, 1): 0.33, (36, 3): 0.165}
+"""Asked: the largest error by the number of poses, and of knocked ones [mg]."""
+
+
+def knocks_of(count: int, knocked: int, noise: str, seed: int) -> tuple[float, float, bool]:
+    """
+    Fit a set with knocked poses.
+
+    Returns
+    -------
+    float, float, bool
+        Error of |a| on fresh directions, and that of a fit to the other poses [mg]; whether each
+        knock that shows is rejected, and no clean pose.
+
+    """
+    rng = np.random.default_rng([seed, count, knocked])
+    case = draw_case(rng, count, noise=noise)
+    rows, reading = rng.choice(count, knocked, replace=False), case.poses.reading.copy()
+    reading[rows] += 0.05 * random_directions(knocked, rng)
+    shows = np.abs(case.sensor.lengths(reading) - case.sensor.lengths(case.poses.reading)) * MG
+    fresh, errors = case.sensor.reading(random_directions(300, rng)), []
+    for poses in (case.poses.with_columns(reading=reading),
+                  case.poses.take(np.isin(np.arange(count), rows, invert=True))):
+        found = fit(case._replace(poses=poses), '10')
+        errors.append(np.inf if found is None else length_error_mg(found.correct(fresh)))
+        if len(errors) == 1:
+            named = set() if found is None else {each.row - 1 for each in found.rejected}
+            is_right = found is not None and {*np.flatnonzero(shows >= SHOWS_MG)} <= named
+    return errors[0], errors[1], is_right and named <= {*rows.tolist()}
+
+
+def knocks(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
+    """Yield the lines of clean and knocked sets."""
+    for (count, knocked), most in MOST_MG.items():
+        for noise in ('measured', 'not given'):
+            errors, best, right = zip(*frame.run_sets(
+                knocks_of, sets, count, knocked, noise, first=seed))
+            what, middle = f'{count} poses, clean{NOISES[noise]}', float(np.median(errors))
+            if knocked:
+                what = what.replace('clean', f'{knocked} knocked by 50 mg')
+            yield check(f'{what}: error [mg] (of a fit to the right rows)',
+                        f'{middle:.3f} ({np.median(best):.3f})', middle, most=most, sets=sets)
+            yield share(f'{what}: each that shows by {SHOWS_MG:g} mg rejected, no clean one'
+                        if knocked else f'{what}: no pose rejected', right,
+                        least=95.0 if knocked else 98.0)
+
+
+def bound_of(count: int, noise: str, seed: int) -> tuple[Floats, Floats]:
+    """Return the errors of model 10 over their Cramér-Rao bounds and over their stated sizes."""
+    case = draw_case(np.random.default_rng([seed, count]), count, noise=noise)
+    found = fit(case, '10')
+    assert found is not None
+    jacobian = case.sensor.length_slopes(case.force) / case.noise
+    bound = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+    away = found.model.vector - case.sensor.values('10')
+    return away / bound, away / np.sqrt(np.diag(found.covariance))
+
+
+def bounds(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
+    """Yield the lines of parameters against the Cramér-Rao bound."""
+    for noise, counts in (('measured', (12, 36, 1000)), ('scatter', (24, 36, 100))):
+        for count in counts:
+            over, stated = (rms(np.array(each)) for each in zip(*frame.run_sets(
+                bound_of, 5 * sets, count, noise, first=seed)))
+            what = f'{count} poses{NOISES[noise]}'
+            yield check(f'{what}: RMS error of the parameters over the Cramér-Rao bound',
+                        f'{over:.3f}', over, most=1.05, sets=5 * sets)
+            yield Line(f'{what}: the same over the stated deviation', f'{stated:.3f}', 5 * sets)
 
 
 def interval_of(kind: str, model: str, count: int, noise: str, seed: int
@@ -100,8 +174,12 @@ def choices(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
                         f'{best})', ratio, most=1.05, sets=2 * sets)
 
 
-def robustness(frame: Frame, sets: int = 200, seed: int = 1) -> Iterator[str]:
-    yield table([*intervals(frame, sets, 100_000 * seed), *choices(frame, sets, 100_000 * seed)])
+ROWS = {each.__name__: each for each in (knocks, bounds, intervals, choices)}
+
+
+def robustness(frame: Frame, sets: int = 200, seed: int = 1, only: tuple[str, ...] = tuple(ROWS)
+               ) -> Iterator[str]:
+    yield table(line for name in only for line in ROWS[name](frame, sets, 100_000 * seed))
 
 
 # ----------------------------------------------------------------------------------------- rating

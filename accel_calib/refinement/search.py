@@ -346,6 +346,7 @@ def _search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
         beside = settle(begun, poses_g, fixed, (*names, *products))
         if not {*products}.isdisjoint(beside[1].names):
             state, near, trial = beside
+        del beside  # before the next columns are made
     out, begun = near.chosen.out, fit_without(begun, poses_g, near.chosen.out)
     first = fit_without(start, poses_g, out) if out else start
     found = Found(first, state, np.array(out, np.intp), near)
