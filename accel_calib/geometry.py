@@ -147,14 +147,17 @@ def coverage(directions: Floats) -> float:
 
 def orientations_of(directions: Floats) -> Indices:
     """Return the (n,) number of the orientation of (n, 3) unit vectors; others are 5° apart."""
-    first, found = np.zeros_like(directions), np.zeros(len(directions), np.intp)
-    count = 0
-    for k, direction in enumerate(directions):
-        near = np.flatnonzero(first[:count] @ direction >= _SAME)
-        if len(near):
-            found[k] = near[0]
-        else:
-            first[count], found[k], count = direction, count, count + 1
+    first, found, count = np.zeros_like(directions), np.zeros(len(directions), np.intp), 0
+    for start in range(0, len(directions), _BLOCK):
+        block = directions[start:start + _BLOCK]
+        near = block @ first[:count].T >= _SAME
+        place = np.argmax(np.column_stack([near, np.ones(len(block), bool)]), axis=1)
+        found[start:start + _BLOCK] = place
+        for k in start + np.flatnonzero(place == count):  # none of the blocks before is near
+            own = np.flatnonzero(first[:count] @ directions[k] >= _SAME)
+            if not len(own):
+                first[count], own, count = directions[k], np.array([count]), count + 1
+            found[k] = own[0]
     return found
 
 

@@ -137,14 +137,18 @@ def left_out(residual: Floats, basis: Floats, pose: Indices, force: Floats, leas
 
     """
     fold = orientations_of(unit(force))
-    fold = (fold if np.ptp(fold) else np.arange(len(fold)))[pose]
-    found, smallest = np.empty_like(residual), 1.0
+    fold = np.unique((fold if np.ptp(fold) else np.arange(len(fold)))[pose],
+                     return_inverse=True)[1]
     order = np.argsort(fold, kind='stable')
-    for rows in np.split(order, np.flatnonzero(np.diff(fold[order])) + 1):
-        size, axes = np.linalg.eigh(np.eye(len(rows)) - basis[rows] @ basis[rows].T)
-        smallest = min(smallest, float(size[0]))
-        found[rows] = axes @ ((axes.T @ residual[rows]) / np.maximum(size, least))
-    return found, smallest
+    parts = np.split(order, np.flatnonzero(np.diff(fold[order])) + 1)
+    # With B = `basis` of an orientation and BᵀB = A Λ Aᵀ, that is r + B A (I - Λ)⁻¹ Aᵀ Bᵀ r.
+    share, axes = np.linalg.eigh([basis[rows].T @ basis[rows] for rows in parts])
+    own = 1.0 - share
+    weight = np.where(own < least, (1.0 - least) / np.maximum(share, least), 1.0) / np.maximum(
+        own, least)
+    onto = np.array([basis[rows].T @ residual[rows] for rows in parts])
+    moved = np.einsum('gij,gj,gkj,gk->gi', axes, weight, axes, onto, optimize=True)
+    return residual + np.sum(basis * moved[fold], axis=1), float(np.min(own, initial=1.0))
 
 
 def by_pose(residual: Floats, columns: Floats, pose: Indices,
