@@ -150,14 +150,15 @@ def orientations_of(directions: Floats) -> Indices:
     first, found, count = np.zeros_like(directions), np.zeros(len(directions), np.intp), 0
     for start in range(0, len(directions), _BLOCK):
         block = directions[start:start + _BLOCK]
-        near = block @ first[:count].T >= _SAME
+        near, before = block @ first[:count].T >= _SAME, count
         place = np.argmax(np.column_stack([near, np.ones(len(block), bool)]), axis=1)
         found[start:start + _BLOCK] = place
-        for k in start + np.flatnonzero(place == count):  # none of the blocks before is near
-            own = np.flatnonzero(first[:count] @ directions[k] >= _SAME)
-            if not len(own):
-                first[count], own, count = directions[k], np.array([count]), count + 1
-            found[k] = own[0]
+        for k in (start + np.flatnonzero(place == before)).tolist():
+            own = (first[before:count] @ directions[k] >= _SAME).nonzero()[0]
+            if len(own):
+                found[k] = before + own[0]
+            else:
+                first[count], found[k], count = directions[k], count, count + 1
     return found
 
 
