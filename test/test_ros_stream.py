@@ -23,7 +23,7 @@ from rclpy.serialization import serialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import BatteryState, FluidPressure, Imu, Temperature
 from shared import GRAVITY, OWN, Readings, Stored, with_effects
-from std_msgs.msg import Bool, Float32, Float64
+from std_msgs.msg import Bool, Float32, Float64, Float64MultiArray
 
 READING = np.array([1.0, -2.0, 9.3])
 RATE = np.array([0.1, 0.2, -0.3])
@@ -247,11 +247,13 @@ def test_each_type_of_context_is_read_and_what_cannot_be_read_is_said(bench: Any
     diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
     publishers = {name: (bench.node.create_publisher(kind, topic, 10), value)
                   for name, (topic, kind, value) in TOPICS.items()}
+    bench.node.create_publisher(Float64MultiArray, 'array', 10)  # its layout is no quantity
     entries = [f'{name.split()[0]}:=/{topic}' for name, (topic, *_) in TOPICS.items()]
     bench.calibrator(context=[*entries, 'text:=/imu/data_raw', 'none:=/nowhere',
-                              'spread:=/rotor/variance'])
+                              'spread:=/rotor/variance', 'array:=/array'])
     wanted = ('no text arrives: /imu/data_raw has the type sensor_msgs/Imu with the numbers '
               'orientation.x, ', 'no none arrives: there is no topic /nowhere',
+              'no array arrives: /array has the type std_msgs/Float64MultiArray with no number',
               'topics with a number: /air, /battery, /die, /load, /rotor')
 
     def said() -> bool:

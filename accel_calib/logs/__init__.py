@@ -15,7 +15,7 @@ from .autopilot import ARDUPILOT_REFERENCE, ByAxis, DEGREE, PER_MILLION
 from .bag import (
     ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
     IMU_DOUBLES, imus_of, joined, Layout, layout_of, layout_with, LITTLE_ENDIAN, NAME_AT, NINE,
-    open_bag, ORIENTATION, ORIENTATION_COVARIANCE, STAMP, STAMP_AT, THREE)
+    NO_QUANTITIES, open_bag, ORIENTATION, ORIENTATION_COVARIANCE, STAMP, STAMP_AT, THREE)
 from .bag_samples import field_of, messages_of, named_topics, topic_and_field
 from .child import parts_of
 from .columns import LogOptions

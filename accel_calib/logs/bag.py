@@ -259,8 +259,9 @@ _BLOCK_BYTES = 1 << 24
 
 NUMBERS = ('float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32', 'int64',
            'uint64')
-_NO_QUANTITIES = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time',
-                  'builtin_interfaces/msg/Duration', 'std_msgs/msg/MultiArrayLayout')
+NO_QUANTITIES = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time',
+                 'builtin_interfaces/msg/Duration', 'std_msgs/msg/MultiArrayLayout')
+"""Types whose numbers are not quantities of the user."""
 
 Received = tuple['Connection', int, bytes]
 """Connection, time of receipt [ns] and serialized message."""
@@ -344,7 +345,7 @@ class Bag:
             for name, (kind, about) in types[msgtype][1]:
                 if kind == Nodetype.BASE and str(about[0]) in NUMBERS:
                     yield '.'.join((*path, name))
-                elif kind == Nodetype.NAME and str(about) not in _NO_QUANTITIES:
+                elif kind == Nodetype.NAME and str(about) not in NO_QUANTITIES:
                     yield from below(str(about), (*path, name))
 
         known = connection.msgtype in types

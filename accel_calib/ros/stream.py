@@ -33,7 +33,7 @@ from .declare import published_by_others, SENSOR
 from ..errors import AccelCalibError, InputError
 from ..logs import (
     ACCELERATION, field_of, IMU_DOUBLES, joined, Layout, layout_of, LITTLE_ENDIAN, NAME_AT,
-    named_topics, THREE, topic_and_field)
+    named_topics, NO_QUANTITIES, THREE, topic_and_field)
 from ..messages import motion_of, output_frame, Rewriter, Triple
 from ..session import Around, BATCH, CalibratorSettings, columns_of, Session
 from ..table import Floats
@@ -61,8 +61,6 @@ _WITH_A_NUMBER = tuple(f'{package}/msg/{name}' for package, names in (
     ('std_msgs', ('Float32', 'Float64'))) for name in names)
 """Types whose topics are named to the user."""
 
-_TIMES = ('std_msgs/Header', 'builtin_interfaces/Time', 'builtin_interfaces/Duration')
-
 _NUMBER = re.compile(r'(float|double|u?int)\d*')
 
 
@@ -72,8 +70,9 @@ def _fields_of(kind: Any, before: str = '') -> list[str]:
     for name, of_field in kind.get_fields_and_field_types().items():
         if _NUMBER.fullmatch(of_field):
             found.append(before + name)
-        elif re.fullmatch(r'\w+/\w+', of_field) and of_field not in _TIMES:
-            inner = _type_of(of_field.replace('/', '/msg/'))
+        elif re.fullmatch(r'\w+/\w+', of_field) and (
+                kind_of_field := of_field.replace('/', '/msg/')) not in NO_QUANTITIES:
+            inner = _type_of(kind_of_field)
             found += [] if inner is None else _fields_of(inner, f'{before}{name}.')
     return found
 
