@@ -224,8 +224,9 @@ def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions
 
 def _ramp_intake(cells: Poses, log: OpenLog) -> RampIntake:
     """Return the ramp of a still board from the samples of a log in cells."""
-    unused = next((each for each in log.findings if each.kind == 'not_used'), None)
-    if unused is not None and np.isnan(range_of(cells, 'temperature')[0]):
+    unused = next((each for each in log.findings
+                   if (each.kind, each.about) == ('not_used', 'temperature')), None)
+    if unused is not None:
         raise InputError(f'{unused.text}, expected the temperature of the sensor', unused.advice)
     ramp = ramp_of(cells)
     low, high = range_of(ramp.stretches, 'temperature')

@@ -157,6 +157,10 @@ def test_rests_with_times_in_another_unit_are_read_right_or_refused_with_the_uni
     assert 'probably in a unit that is 1000' in refused(capsys, 'thermal', path)
     write_table(path, rests.with_columns(temperature=rests['temperature'] + 273.15))
     assert 'state its unit in the name' in refused(capsys, 'thermal', path)
+    log, count = ramp(3, BENT), 3000
+    log = log.take(slice(0, count)).with_columns(rate=np.full((count, 3), 7e4))
+    write_table(path, log.without_columns('temperature'))
+    assert 'no temperature' in refused(capsys, 'thermal', path)  # whatever the gyro reads
 
 
 @pytest.mark.parametrize(('low', 'high', 'reference'), [

@@ -475,7 +475,7 @@ def are_samples(columns: Mapping[str, NDArray[Any]], fewest: int = _FEW_POSES) -
 def _leave_out(made: Quantities, key: str, why: str, advice: str) -> None:
     made.chosen = replace(made.chosen, sources={
         name: own for name, own in made.chosen.sources.items() if name != key})
-    made.findings.append(Finding('not_used', f'{why} not used', advice))
+    made.findings.append(Finding('not_used', f'{why} not used', advice, about=key))
 
 
 def _decide_rate(made: Quantities, first: Cells) -> None:
