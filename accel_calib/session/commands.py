@@ -163,9 +163,8 @@ def _compute(session: Holder, function: Callable[..., Fitted], **given: Any) -> 
                               before=sensor.present, **given)
     except RefusedFitError as error:
         session.refuse('poses', error.advice if error.offer is None else error.message)
-        if error.offer is not None:
-            error = RefusedFitError(
-                error.message, f'{_asked(session, error.advice)}{error.offer}')
+        if error.offer is not None and (asked := _asked(session)):
+            error = RefusedFitError(error.message, f'{asked}{error.offer}')
         raise error from None
     finally:
         session.change(computing=session.state.computing - 1)
@@ -180,7 +179,7 @@ def _compute(session: Holder, function: Callable[..., Fitted], **given: Any) -> 
         why, advice = refusal
         is_asked = refinement is None and rating.next.kind == 'poses'  # the step names the pose
         session.refuse('poses', why if is_asked else advice)
-        advice = _asked(session, advice) if is_asked else advice
+        advice = (_asked(session) if is_asked else '') or advice
         if refinement is not None:
             rate(session, refinement)
         raise RefusedFitError(f'{found.words}; not used: {why}', advice)
@@ -188,10 +187,10 @@ def _compute(session: Holder, function: Callable[..., Fitted], **given: Any) -> 
     return found
 
 
-def _asked(session: Holder, advice: str) -> str:
-    """Return the pose that the next step asks for; if it asks for none, the advice."""
+def _asked(session: Holder) -> str:
+    """Return the pose that the next step asks for; empty if it asks for none."""
     step = step_of(session.sensor.guide, may_fit=False)
-    return step.text if step.direction else advice
+    return step.text if step.direction else ''
 
 
 def _use(session: Holder, fitted: Fitted, *, offers: bool) -> Part[str]:
