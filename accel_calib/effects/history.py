@@ -186,9 +186,6 @@ _APART = 2.0
 _POINTS = 3600
 """Largest number of temperatures of the history: two hours, many times a common lag."""
 
-_RECENT = 300
-"""Number of recent points whose columns are kept: ten minutes, twice the longest of a rest."""
-
 
 @dataclass(frozen=True, eq=False)
 class TemperatureHistory:
@@ -202,8 +199,8 @@ class TemperatureHistory:
     points : deque of (float, float)
         Times and temperatures.
     followed : dict
-        By what a model needs: its stream, and the columns at the recent points. Models that are
-        asked for are followed.
+        By what a model needs: its stream, and the columns at the points. Models that are asked for
+        are followed.
 
     """
 
@@ -259,13 +256,13 @@ class TemperatureHistory:
         return {key: np.array([np.mean([each[key] for each in inside])]) for key in inside[0]}
 
     def _follow(self, model: Model) -> tuple[ThermalStream | None, Iterable[tuple[float, Any]]]:
-        """Return the stream of a model, which is followed from now on, and its recent columns."""
+        """Return the stream of a model, which is followed from now on, and its columns."""
         key, stream = (tuple(model.lags.items()), 'temperature_rate' in model.over), (
             thermal_stream(model))
         if stream is None:
             return None, ()
         if key not in self.followed:
-            columns = deque[tuple[float, Any]](maxlen=_RECENT)
+            columns = deque[tuple[float, Any]](maxlen=_POINTS)
             for time, temperature in self.points:
                 stream.add(time, temperature)
                 columns.append((time, stream.value))
