@@ -38,7 +38,7 @@ from accel_calib.effects import (
     acting_temperature, correct, linear_model, Model, model_with, MODELS, OwnEffect, parse_effect,
     predict, sensor_force, simulate_poses, simulate_recording, ThermalStream, with_vector)
 from accel_calib.effects.thermal import Lag, low_passed, rate_of
-from accel_calib.estimate import believable, kinds, originals, unseen_mistakes
+from accel_calib.estimate import believable, kinds, left_out, originals, unseen_mistakes
 from accel_calib.estimate.closed_form import agreeing
 from accel_calib.estimate.equations import equations, measured
 from accel_calib.findings import mounting_figures
@@ -50,7 +50,8 @@ from accel_calib.fleet.recording import (
 from accel_calib.fleet.run import mapped
 from accel_calib.fleet.sensors import alike, drift_of, merge_sensor, write_parquet
 from accel_calib.geometry import (
-    distinct, OVER_THE_SPHERE, quaternion_of, rotation_from_rpy, spread_directions, unit, words_of)
+    distinct, orientations_of, OVER_THE_SPHERE, quaternion_of, rotation_from_rpy,
+    spread_directions, unit, words_of)
 from accel_calib.logs import (
     bag_samples, child, is_port, layout_with, LogOptions, open_bag, open_log, port, text)
 from accel_calib.logs.names import meaning

@@ -10,9 +10,9 @@ from accel_calib.errors import RefusedFitError
 from accel_calib.geometry import sphere_through
 from accel_calib.table import Poses
 from inside import (
-    axes_of, determines, fault_of, missing_poses, model_with, MODELS, mounting, poses_needed,
-    predict, refuse_if_unfit, rotation_from_rpy, rows_of, simulate_poses, spread_directions, unit,
-    with_heading)
+    axes_of, determines, fault_of, left_out, missing_poses, model_with, MODELS, mounting,
+    orientations_of, poses_needed, predict, refuse_if_unfit, rotation_from_rpy, rows_of,
+    simulate_poses, spread_directions, unit, with_heading)
 import numpy as np
 import pytest
 from shared import attitudes, FACES, G, random_directions, sensor
@@ -166,3 +166,27 @@ def test_correct_wiring_causes_no_warning(seed):
     assert not fit_poses(wired(np.eye(3), seed), G).warnings
     tilted = wired(rotation_from_rpy(*np.radians((8.0, -5.0, 10.0))), seed)
     assert fault_of(axes_of(tilted.reading, tilted['reference'])) is None
+
+
+@pytest.mark.parametrize('count', [30, 2500])
+def test_an_orientation_is_held_out_with_all_of_its_rows(count):
+    rng = np.random.default_rng(count)
+    force = random_directions(count, rng)
+    if count < 100:
+        force = about(force[:12], count, 0.5, rng)
+    number = orientations_of(force)
+    places, first = np.unique(number, return_index=True)
+    assert np.all(np.diff(first) > 0)
+    near = np.sum(force * force[first][number], axis=1)
+    assert np.min(near) >= np.cos(np.radians(5.0))
+    assert np.max(force[first] @ force[first].T - 2.0 * np.eye(len(first))) < np.cos(
+        np.radians(5.0))
+    columns, measured = rng.normal(size=(count, 4)), rng.normal(size=count)
+    basis = np.linalg.qr(columns)[0]
+    held, smallest = left_out(measured - basis @ (basis.T @ measured), basis, np.arange(count),
+                              force, 1e-9)
+    for place in places[:5]:
+        own = number == place
+        values = np.linalg.lstsq(columns[~own], measured[~own], rcond=None)[0]
+        np.testing.assert_allclose(held[own], measured[own] - columns[own] @ values, atol=1e-9)
+    assert 0.0 < smallest < 1.0
