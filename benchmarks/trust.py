@@ -57,15 +57,14 @@ def knocks_of(count: int, knocked: int, noise: str, seed: int) -> tuple[float, f
     rows, reading = rng.choice(count, knocked, replace=False), case.poses.reading.copy()
     reading[rows] += 0.05 * random_directions(knocked, rng)
     shows = np.abs(case.sensor.lengths(reading) - case.sensor.lengths(case.poses.reading)) * MG
-    fresh, errors = case.sensor.reading(random_directions(300, rng)), []
-    for poses in (case.poses.with_columns(reading=reading),
-                  case.poses.take(np.isin(np.arange(count), rows, invert=True))):
-        found = fit(case._replace(poses=poses), '10')
-        errors.append(np.inf if found is None else length_error_mg(found.correct(fresh)))
-        if len(errors) == 1:
-            named = set() if found is None else {each.row - 1 for each in found.rejected}
-            is_right = found is not None and {*np.flatnonzero(shows >= SHOWS_MG)} <= named
-    return errors[0], errors[1], is_right and named <= {*rows.tolist()}
+    fresh = case.sensor.reading(random_directions(300, rng))
+    found, best = (fit(case._replace(poses=poses), '10') for poses in (
+        case.poses.with_columns(reading=reading),
+        case.poses.take(np.isin(np.arange(count), rows, invert=True))))
+    error, least = (np.inf if each is None else length_error_mg(each.correct(fresh))
+                    for each in (found, best))
+    named = {-1} if found is None else {each.row - 1 for each in found.rejected}
+    return error, least, {*np.flatnonzero(shows >= SHOWS_MG)} <= named <= {*rows.tolist()}
 
 
 def knocks(frame: Frame, sets: int, seed: int) -> Iterator[Line]:

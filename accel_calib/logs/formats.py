@@ -281,12 +281,12 @@ def _without_empty_cells(blocks: Iterable[Poses]) -> Iterator[Recording]:
     for block in blocks:
         columns = {key: block[key] for key in CONTEXT if key in block}
         for key, values in columns.items():
-            known = np.flatnonzero(np.isfinite(values))
-            place = np.concatenate([np.full(len(last.get(key, [])), -1), known])
-            last[key] = np.concatenate([last.get(key, np.zeros(0)), values[known]])
-            if len(place):
-                columns[key] = np.interp(np.arange(len(values)), place, last[key])
-            last[key] = last[key][-1:]
+            known, before = np.flatnonzero(np.isfinite(values)), last.get(key, values[:0])
+            track = np.concatenate([before, values[known]])
+            if len(track):
+                columns[key] = np.interp(np.arange(len(values)), [-1] * len(before) + [*known],
+                                         track)
+            last[key] = track[-1:]
         yield Recording(**vars(block.with_columns(**columns)))
 
 
@@ -298,7 +298,8 @@ def _without_holes(poses: Poses, findings: list[Finding]) -> Poses:
             findings.append(Finding(
                 'not_used', f'{key} is not used, because of cells without a number '
                 f'({len(holes)} of {len(poses)})', f'fill in the cells of {key} that have no '
-                'number, or remove their rows', rows=tuple(poses.row[holes].tolist())))
+                'number, or remove their rows', rows=tuple(poses.row[holes].tolist()),
+                about=key))
             poses = poses.without_columns(key)
     return poses
 
