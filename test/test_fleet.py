@@ -238,7 +238,9 @@ def test_a_copy_counts_once_and_a_moved_recording_leaves_its_sensor(
          [2, 3]),
         (lambda: None, {'skipped': 6}, [2, 3]),
         (lambda: second.rename(folder / 'robot_0' / 'moved.csv'), {'ok': 1, 'skipped': 5},
-         [3, 2])]
+         [3, 2]),
+        ((folder / 'robot_0' / 'copy.csv').unlink, {'skipped': 5}, [3, 2]),
+        (lambda: first.rename(folder / 'moved.csv'), {'ok': 1, 'skipped': 4}, [2, 2])]
     for change, counts, rows in changes:
         change()
         assert run(client, found_in(folder), QUICK, store).counts == counts

@@ -77,8 +77,8 @@ class Store:
     """
     The folder of the results; all workers must see it under this name.
 
-    It has the data set in ``recordings``, rows to be merged in ``pending``, and the keys of rows
-    that are merged in ``done``.
+    It has the data set in ``recordings``, rows to be merged in ``pending``, the keys of rows that
+    are merged in ``done``, and the folders of their sensors in ``places``.
 
     """
 
@@ -100,9 +100,8 @@ class Store:
 
         text, names = json.dumps(row), {as_folder(row['sensor'])}
         pa.Table.from_pylist([json.loads(text)], schema())
-        for place in map(self.place, (row['recording'], row['content'])):
-            if place.exists():
-                names.add(place.read_text(encoding='utf-8').partition('\n')[0])
+        for known in self.places(row).values():
+            names.update(known)
         for name in names:
             path = self.folder / 'pending' / name / f'{row["key"]}.json'
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -147,10 +146,14 @@ class Store:
             for path in (self.folder / 'calibrations' / name).glob(f'{key}*'):
                 path.unlink(missing_ok=True)
         for row in added:
-            for mark in (self.mark(row['key']), *map(
-                    self.place, (row['recording'], row['content']))):
-                mark.parent.mkdir(parents=True, exist_ok=True)
-                mark.write_text(f'{name}\n{row.get("calibration", "")}', encoding='utf-8')
+            mark = self.mark(row['key'])
+            mark.parent.mkdir(parents=True, exist_ok=True)
+            mark.write_text(f'{name}\n{row.get("calibration", "")}', encoding='utf-8')
+            for place, known in self.places(row).items():
+                if name not in known:
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    with place.open('a', encoding='utf-8') as file:
+                        file.write(f'{name}\n')
 
     def finish(self, name: str) -> None:
         """Remove the pending rows of a sensor that are in the data set."""
@@ -207,9 +210,14 @@ class Store:
         """Return the file that is there if the result with this key is in the data set."""
         return self.folder / 'done' / key[:2] / key
 
-    def place(self, name: str) -> Path:
-        """Return the file with the folder of the sensor that has this recording, or content."""
-        return self.mark(blake2b(name.encode(), digest_size=16).hexdigest())
+    def places(self, row: Row) -> dict[Path, list[str]]:
+        """Return the folders of sensors that had the recording of a row, or its content, by file."""
+        found = {}
+        for column in ('recording', 'content'):
+            key = blake2b(row[column].encode(), digest_size=16).hexdigest()
+            place = self.folder / 'places' / key[:2] / key
+            found[place] = place.read_text('utf-8').splitlines() if place.exists() else []
+        return found
 
 
 def write_parquet(path: Path, rows: list[Row], columns: pa.Schema) -> None:
