@@ -17,7 +17,7 @@ import shlex
 from typing import NamedTuple, TYPE_CHECKING
 
 from .options import (
-    add_options, any_log, BASE, CAPTURE, late, LOG, option, Options, outputs, Parser, poses,
+    add_options, any_log, BASE, CAPTURE, count, late, LOG, option, Options, outputs, Parser, poses,
     positive, report, shared, source, STANDARD_INPUT, stored, units)
 from .. import __version__
 
@@ -107,15 +107,6 @@ def next_command(step: 'NextStep', args: argparse.Namespace) -> str:
     return ''
 
 
-def _flat(text: str) -> int | str:
-    if text in ('first', 'last'):
-        return text
-    try:
-        return int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f'{text}: expected a row, first or last') from None
-
-
 def _regex(text: str) -> str:
     try:
         re.compile(text)
@@ -135,9 +126,7 @@ _FROM_LOGS: Options = (
     option('-o', '--output', type=Path, default=Path('calibration.yaml'), metavar='FILE',
            help='calibration to write (default: %(default)s); the page has the same name with '
            '.html'),
-    option('--flat', type=_flat, metavar='ROW', help='pose with the robot level: its row, '
-           '1-based, or first or last; it determines the mounting'),
-    *shared('--nose-down', '--frame', '--keep-bad'))
+    *shared('--flat', '--nose-down', '--frame', '--keep-bad'))
 """Options of a command from logs to a calibration and a page beside it."""
 
 _CALIBRATIONS: Options = (
@@ -200,9 +189,7 @@ COMMANDS = {
                    help='ml (default) weights poses by their noise and leaves out outliers; '
                    "algebraic minimises the cost functions of AN5286 and the ESGI'95 report, with "
                    'every row'),
-            option('--flat', type=int, metavar='ROW', help='row of a pose with the robot level, '
-                   '1-based; it determines the mounting'),
-            *shared('--nose-down', '--frame', '--keep-bad', *_FLEET, '--verbose')),
+            *shared('--flat', '--nose-down', '--frame', '--keep-bad', *_FLEET, '--verbose')),
         writes='calibration'),
     'verify': Command(
         'evaluate a calibration on poses that it was not fitted to', 'compare',
@@ -241,7 +228,7 @@ COMMANDS = {
                    'must see it', **_OUTPUT),
             option('--scheduler', default='', metavar='ADDRESS', help='address of a Dask '
                    'scheduler (default: a cluster on this machine)'),
-            option('--workers', type=int, metavar='N', help='workers on this machine (default: '
+            option('--workers', type=count, metavar='N', help='workers on this machine (default: '
                    'one per core)'),
             option('--sensor-from', type=_regex, default='', metavar='REGEX',
                    help='take the name of the sensor from the path: the groups, or the whole '
@@ -353,7 +340,7 @@ COMMANDS = {
             option('--host', default='127.0.0.1', metavar='ADDRESS', help='address at which the '
                    'page is served; 0.0.0.0: to the whole network, without encryption (default: '
                    '%(default)s)'),
-            option('--baud', type=int, default=115200, help='baud rate of the serial port '
+            option('--baud', type=count, default=115200, help='baud rate of the serial port '
                    '(default: %(default)s)'),
             option('--speed', type=positive, default=1.0, help='speed of a recording, relative to '
                    'real time (default: %(default)s)'),

@@ -98,6 +98,23 @@ def positive(text: str) -> float:
     return value
 
 
+def count(text: str) -> int:
+    """Return a number of 1 or more from an argument."""
+    if int(text) < 1:
+        raise argparse.ArgumentTypeError(f'{text}: expected 1 or more')
+    return int(text)
+
+
+def flat_row(text: str) -> int | str:
+    """Return a row from an argument, or first or last."""
+    if text in ('first', 'last'):
+        return text
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f'{text}: expected a row, first or last') from None
+
+
 def utf8(text: str) -> str:
     """Return an argument that can be stored: text in UTF-8."""
     try:
@@ -217,8 +234,10 @@ def stored(about: str = 'stored calibration', **more: Any) -> Option:
 
 SHARED = {each.names[-1]: each for each in (
     option('--rows', metavar='A:B', help='rows A to B, 1-based, inclusive'),
-    option('--jobs', type=int, default=1, metavar='N', help='number of tables to process in '
+    option('--jobs', type=count, default=1, metavar='N', help='number of tables to process in '
            'parallel'),
+    option('--flat', type=flat_row, metavar='ROW', help='pose with the robot level: its row, '
+           '1-based, or first or last; it determines the mounting'),
     option('--nose-down', type=int, metavar='ROW', help='row of a pose with the nose of the robot '
            'tilted straight down, by 10° or more; it determines the heading of the mounting '
            '(needs --flat)'),
