@@ -14,7 +14,7 @@ from rich.table import Table
 from .commands import next_command
 from .frame import (
     Done, FAILED, intake, log_options, NARROW, progress, read_lines, rows_between, short_if_known,
-    stored_calibration, table, Verdict)
+    stored_calibration, table)
 from ..calibration import verify
 from ..comparison import compare, history_of
 from ..errors import InputError
@@ -52,26 +52,23 @@ def run_verify(args: argparse.Namespace) -> Done:
               'rating_lines': [*rating.lines, *([f'      {command}'] if command else [])]}
     above = args.max is not None and not verification.rms_after_mg <= args.max
     result |= {} if args.max is None else {'max_mg': args.max, 'above_max': above}
-    return Done(result, several_verify([plain(result)]),
+    return Done(result, several_verify([plain(result)], named=False),
                 status=FAILED if above or rating.name == 'BAD' else 0, page=page)
 
 
-def several_verify(results: Sequence[dict[str, Any]]) -> Iterator[Any]:
+def several_verify(results: Sequence[dict[str, Any]], *, named: bool = True) -> Iterator[Any]:
     """Yield how the logs were read, a row for each, and the ratings."""
-    names = [f'{result["file"]}: ' if len(results) > 1 else '' for result in results]
+    names = [f'{result["file"]}: ' if named else '' for result in results]
     for name, result in zip(names, results, strict=True):
-        yield from (f'{name}{line}' for line in result.get('read_lines', ()))
-        if 'error' in result:
-            yield f'{name}{result["error"]}; {result["advice"]}'
+        yield from (f'{name}{line}' for line in result['read_lines'])
     yield table(
         'Residual of |force| over these poses [mg]',
         ('poses', 'before', 'after', 'largest after', 'noise floor'),
         ((result['file'], short(result['rms_before_mg']), short(result['rms_after_mg']),
           short(result['max_after_percent'] * 10), short_if_known(result['noise_floor_mg']))
-         for result in results if 'error' not in result))
+         for result in results))
     for name, result in zip(names, results, strict=True):
-        for k, line in enumerate(result.get('rating_lines', ())):
-            yield f'{name}{line}' if k else Verdict(f'{name}{line}', result['rating'], len(name))
+        yield from (f'{name}{line}' for line in result['rating_lines'])
         if result.get('above_max'):
             yield (f'{name}residual {short(result["rms_after_mg"])} mg is above --max '
                    f'{result["max_mg"]:g} mg: exit status {FAILED}')

@@ -22,13 +22,13 @@ from rich.table import Table
 
 from .frame import (
     check_target, console, Done, given, intake, log_options, Output, progress, read_lines,
-    rows_between, short_if_known, stored_calibration, table, Target, Verdict, working)
+    rows_between, short_if_known, stored_calibration, table, Target)
 from ..calibration import Calibration, NORM_MODELS
 from ..disk import STANDARD_OUTPUT, write_atomically
 from ..effects import AXES, entry_of, parse_effect
 from ..errors import InputError
 from ..findings import (
-    base_words, calibration_json, chance_words, effect_figures, linear_figures, outlook,
+    base_words, calibration_json, chance_words, effect_figures, linear_figures, Outlook, outlook,
     plan_lines, rate, Rating, refinement_json, request_words, rival_words, value_words,
     verdict_words)
 from ..logs import is_bag, open_log, write_blocks, write_table
@@ -46,35 +46,31 @@ if TYPE_CHECKING:
 
 def run_fit(args: argparse.Namespace) -> Done:
     """Fit and store a calibration."""
-    with intake(args, args.poses) as found, working('fitting'):
+    with intake(args, args.poses) as found, progress('fitting'):
         rows = rows_between(found.poses, args.rows) if args.rows else None
         outcome = calibrated(found.poses, found.units, plan_of(args, rows=rows, refined=False))
     calibration = outcome.calibration
     ahead = outlook(calibration, args.model)
     return _store(
-        args, outcome, {'file': args.poses, **calibration_json(calibration, ahead),
-                        'read_as': found.read_as, 'read_lines': found.lines},
+        args, outcome, args.poses, found.read_as, found.lines, ahead=ahead,
         shown=_tables(calibration), page=partial(_page, args, args.poses, found, outcome),
-        notes=[f'model {calibration.name}: {calibration.reason}',
-               f'next pose: {request_words(ahead.next_pose)}', *found.lines])
+        first=(f'model {calibration.name}: {calibration.reason}',
+               f'next pose: {request_words(ahead.next_pose)}'))
 
 
 def run_calibrate(args: argparse.Namespace) -> Done:
     """Calibrate and store."""
-    with intake(args, args.log) as found, working('fitting'):
+    with intake(args, args.log) as found, progress('fitting'):
         outcome = calibrated_log(args.log, log_options(args), found, plan_of(args))
     if isinstance(outcome, ThermalOutcome):
         return _store_thermal(args, [args.log], outcome,
                               'its temperature changes: fitted as by accel-calib thermal')
-    calibration, refinement = outcome.calibration, outcome.refinement
+    refinement = outcome.refinement
     return _store(
-        args, outcome,
-        {'file': args.log, **calibration_json(calibration, outlook(calibration, 'auto')),
-         'read_as': found.read_as, 'read_lines': found.lines, 'refined': outcome.line,
-         'refinement': None if refinement is None else refinement_json(refinement)},
-        shown=_tables(calibration) if args.verbose else (),
-        page=partial(_page, args, args.log, found, outcome),
-        notes=[outcome.line, *found.lines])
+        args, outcome, args.log, found.read_as, found.lines, first=(outcome.line,),
+        shown=_tables(outcome.calibration) if args.verbose else (),
+        page=partial(_page, args, args.log, found, outcome), refined=outcome.line,
+        refinement=None if refinement is None else refinement_json(refinement))
 
 
 def run_thermal(args: argparse.Namespace) -> Done:
@@ -84,7 +80,7 @@ def run_thermal(args: argparse.Namespace) -> Done:
         with progress('samples') as moved:
             found.append(ramp_or_poses(path, log_options(args), given(CaptureSettings, args),
                                        moved))
-    with working('fitting'):
+    with progress('fitting'):
         outcome = thermally_calibrated(found, Plan(**given(Plan, args)))
     return _store_thermal(args, args.logs, outcome)
 
@@ -103,13 +99,11 @@ def _store_thermal(args: argparse.Namespace, logs: Sequence[Path], outcome: Ther
     band, (low, high) = f', uncertainty up to {short(curve.band_mg)} mg', curve.range_c
     errors = [*curve.held_out_mg.values()]
     return _store(
-        args, outcome,
-        {'file': list(logs), **calibration_json(calibration, outlook(calibration, 'auto')),
-         'read_as': outcome.read_as, 'read_lines': lines, 'thermal': {
-             'reference_c': curve.reference_c, 'range_c': curve.range_c, 'degree': curve.degree,
-             'effects': [*map(str, curve.model.effects)], 'band_mg': curve.band_mg,
-             'change_mg': curve.change_mg, 'residual_mg': curve.residual_mg,
-             'held_out_mg': curve.held_out_mg}},
+        args, outcome, list(logs), outcome.read_as, lines, thermal={
+            'reference_c': curve.reference_c, 'range_c': curve.range_c, 'degree': curve.degree,
+            'effects': [*map(str, curve.model.effects)], 'band_mg': curve.band_mg,
+            'change_mg': curve.change_mg, 'residual_mg': curve.residual_mg,
+            'held_out_mg': curve.held_out_mg},
         shown=[values if curve.model.effects else
                'the offset does not change with the temperature',
                f'degree {curve.degree} from {low:.1f} to {high:.1f} °C: {short(curve.change_mg)} '
@@ -117,8 +111,7 @@ def _store_thermal(args: argparse.Namespace, logs: Sequence[Path], outcome: Ther
                f'held-out parts of the log: {short(errors[0])} -> {short(errors[-1])} mg',
                *(_tables(calibration) if is_whole and args.verbose else ())],
         page=partial(thermal_page, outcome, list(map(str, logs)), stored=str(args.output),
-                     notes=lines),
-        notes=lines)
+                     notes=lines))
 
 
 def plan_of(args: argparse.Namespace, **more: Any) -> Plan:
@@ -132,23 +125,25 @@ def plan_of(args: argparse.Namespace, **more: Any) -> Plan:
     return plan
 
 
-def _store(args: argparse.Namespace, outcome: Outcome, result: dict[str, Any], *,
-           shown: Iterable[Any], page: Callable[[], str], notes: Sequence[str]) -> Done:
+def _store(args: argparse.Namespace, outcome: Outcome, file: Path | list[Path], read_as: str,
+           lines: Sequence[str], *, shown: Iterable[Any], page: Callable[[], str],
+           first: Sequence[str] = (), ahead: Outlook | None = None, **result: Any) -> Done:
     """
     Write a calibration unless it is BAD, and return what is done.
 
     The rows left out are noted first; if they are several, their reasons come last.
 
     """
-    stored, left_out = _write(args, outcome.calibration, outcome.rating)
-    rejected = outcome.calibration.rejected
-    reasons = [f'left out: row {each.row}: {each.reason}' for each in rejected]
-    if len(rejected) > 1:
-        rows = [each.row for each in rejected]
-        notes = [f'left out: {listed("row", rows)}', *notes, *reasons]
-    else:
-        notes = [*reasons, *notes]
-    return Done(result, [*shown, *left_out], outcome.rating, stored=stored, page=page, notes=notes)
+    calibration = outcome.calibration
+    stored, left_out = _write(args, calibration, outcome.rating)
+    reasons = [f'left out: row {each.row}: {each.reason}' for each in calibration.rejected]
+    notes = [*reasons, *first, *lines]
+    if len(reasons) > 1:
+        rows = [each.row for each in calibration.rejected]
+        notes = [f'left out: {listed("row", rows)}', *first, *lines, *reasons]
+    known = calibration_json(calibration, ahead or outlook(calibration, 'auto'))
+    return Done({'file': file, **known, 'read_as': read_as, 'read_lines': lines, **result},
+                [*shown, *left_out], outcome.rating, stored=stored, page=page, notes=notes)
 
 
 def _write(args: argparse.Namespace, calibration: Calibration, rating: Rating
@@ -170,15 +165,11 @@ def _page(args: argparse.Namespace, log: Path, found: Intake, outcome: Outcome) 
                             stored=str(args.output or 'calibration.yaml'))
 
 
-def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str | Verdict]:
+def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str]:
     """Yield a line for each of several results."""
     for result in results:
-        if 'error' in result:
-            yield f'{result["file"]}: {result["error"]}; {result["advice"]}'
-            continue
-        line = (f'{result["file"]}: model {result["model"]}: {result["rms_before_mg"]:.3g} -> '
-                f'{result["rms_after_mg"]:.3g} mg, ')
-        yield Verdict(f'{line}{result["rating"]}', result['rating'], len(line))
+        yield (f'{result["file"]}: model {result["model"]}: {result["rms_before_mg"]:.3g} -> '
+               f'{result["rms_after_mg"]:.3g} mg, {result["rating"]}')
 
 
 def _tables(calibration: Calibration) -> Iterator[Any]:
@@ -264,7 +255,7 @@ def _refined(args: argparse.Namespace) -> 'tuple[Intake, Refinement]':
     from ..refinement import refine  # a fit alone does not load the search
 
     stored = args.calibration and stored_calibration(args.calibration, args.own)
-    with intake(args, args.poses, stored) as found, working('refining'):
+    with intake(args, args.poses, stored) as found, progress('refining'):
         poses = found.poses.take(rows_between(found.poses, args.rows))
         base = (stored.in_units(found.units) if stored else
                 read_prior(args.prior, args.sensor_model) if args.prior else args.base)
@@ -275,21 +266,18 @@ def _refined(args: argparse.Namespace) -> 'tuple[Intake, Refinement]':
 def several_refine(results: Sequence[dict[str, Any]]) -> Iterator[str]:
     """Yield a line for each of several results."""
     for result in results:
-        line = f'{result["error"]}; {result["advice"]}' if 'error' in result else ''
-        if not line:
-            names = ' + '.join([result['base'], *(step['effect'] for step in result['steps'])])
-            line = (f'{result["verdict"]}: {names}, {short(result["gap_mg"])} -> '
-                    f'{short(result["remaining_gap_mg"])} mg')
-        yield f'{result["file"]}: {line}'
+        names = ' + '.join([result['base'], *(step['effect'] for step in result['steps'])])
+        yield (f'{result["file"]}: {result["verdict"]}: {names}, {short(result["gap_mg"])} -> '
+               f'{short(result["remaining_gap_mg"])} mg')
 
 
 # ----------------------------------------------------------------------------- fleets
 
 def run_fleet(args: argparse.Namespace) -> Done:
     """Calibrate many recordings on Dask."""
-    from ..fleet import cluster, LIMIT_S, Options, recordings, run, STATUS, Store
+    from ..fleet import changes_of, cluster, LIMIT_S, Options, recordings, run, STATUS, Store
 
-    with working('looking for recordings'):
+    with progress('looking for recordings'):
         found = list({each.path: each for each in recordings(args.recordings)}.values())
     asked = Options(**{**given(Options, args), 'log': log_options(args),
                        'settings': given(CaptureSettings, args),
@@ -308,7 +296,8 @@ def run_fleet(args: argparse.Namespace) -> Done:
          f'could not be read, {counts["skipped"]} skipped because they are done',
          *(f'note: a file of the results was damaged and was made again; it is now {path}'
            for path in summary.damaged),
-         *(f'{sensor}: {", ".join(filter(None, about))}' for sensor, *about in summary.changes),
+         *(f'{sensor}: {", ".join(filter(None, about))}'
+           for sensor, *about in changes_of(summary.sensors)),
          f'{counted(len(summary.sensors), "sensor")}, stored in {args.output}'],
         summary.rating)
 

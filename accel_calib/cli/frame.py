@@ -144,7 +144,11 @@ def run(args: argparse.Namespace) -> int:
     results = [result for _, result in outcomes]
     write_json(args.json, results)
     output = console(args)
-    for line in _function('several', args.command)(results):
+    for result in results:
+        if 'error' in result:
+            output.print(f'{result["file"]}: {result["error"]}; {result["advice"]}')
+    for line in _function('several', args.command)(
+            [result for result in results if 'error' not in result]):
         output.print(line)
     return max(status for status, _ in outcomes)
 
@@ -166,7 +170,7 @@ def _carry_out(args: argparse.Namespace) -> Done:
 
             try:
                 check_matplotlib()
-                with working('drawing the page'):
+                with progress('drawing the page'):
                     write_page(page, done.page())
                 done = replace(done, stored=[*done.stored, page])
             except (InputError, OSError) as err:  # beside a calibration, this is only noted
@@ -196,9 +200,8 @@ def _run_one(args: argparse.Namespace) -> int:
         raise done.error
     rating, verbose, lines = done.rating, getattr(args, 'verbose', True), list[Any]()
     if rating is not None:
-        first, *others = rating.lines
         command = done.result['next']['command']
-        lines = [Verdict(first, rating.name), *others, *([f'      {command}'] if command else [])]
+        lines = [*rating.lines, *([f'      {command}'] if command else [])]
     findings = () if rating is None else rating.findings[rating.name != 'GOOD':]
     notes = [*(f'note: {each.words if verbose else each.text}' for each in findings), *done.notes]
     if not verbose and len(notes) > _MOST_NOTES:
@@ -376,16 +379,8 @@ _TIED = r'(?<=±) | (?=±)|(?<==) | (?==)|(?<=\d) (?=(mg|g|s|h|Hz|%|°|°C|m/s²
 """Spaces at which a line does not break: ``value ± sd``, ``p = 0.1``, ``3 mg``."""
 
 
-class Verdict(NamedTuple):
-    """A line of text with a rating from a character on, which a terminal shows in colour."""
-
-    line: str
-    rating: str
-    start: int = 0
-
-
 class Output(Console):
-    """A console that breaks lines at words, and takes text as it is, without markup."""
+    """A console that breaks lines at words, and colours ratings; text has no markup."""
 
     def __init__(self, stderr: bool = False) -> None:
         super().__init__(stderr=stderr, highlight=False, markup=False, emoji=False)
@@ -396,23 +391,18 @@ class Output(Console):
 
     def print(self, *objects: Any, **options: Any) -> None:  # noqa: A003
         """Print; lines of text break at words, and the rest of a line is indented."""
-        if len(objects) != 1 or not isinstance(given := objects[0], str | Verdict):
+        if len(objects) != 1 or not isinstance(objects[0], str):
             super().print(*objects, **options)
             return
-        line, rating, start = given if isinstance(given, Verdict) else (given, '', 0)
-        text = self._break_lines(line)
-        if rating:
-            end = len(self._break_lines(line[:start + len(rating)]))
-            text.stylize(_COLOURS[rating], end - len(rating), end)
-        super().print(text, soft_wrap=True, **options)
-
-    def _break_lines(self, text: str) -> Text:
         lines = []
-        for line in text.split('\n'):
+        for line in objects[0].split('\n'):
             parts = wrap(re.sub(_TIED, _NO_BREAK, line), self.width, subsequent_indent='  ',
                          break_long_words=False, break_on_hyphens=False)
             lines.append('\n'.join(parts).replace(_NO_BREAK, ' ') or line)
-        return self.render_str('\n'.join(lines))
+        text = self.render_str('\n'.join(lines))
+        for rating, style in _COLOURS.items():
+            text.highlight_regex(rf'\b{rating}\b', style)
+        super().print(text, soft_wrap=True, **options)
 
 
 def shown(text: str, encoding: str) -> str:
@@ -445,7 +435,7 @@ def short_if_known(value: float | None) -> str:
 
 @contextmanager
 def progress(what: str) -> Iterator[Progress]:
-    """Show a progress bar, and yield the function that updates it."""
+    """Show a progress bar for things or an activity; yield the function that updates it."""
     if not sys.stderr.isatty():
         yield lambda done, count: None
         return
@@ -456,13 +446,3 @@ def progress(what: str) -> Iterator[Progress]:
         task = bar.add_task(what, total=None)  # the bar moves to and fro until a number is known
         yield lambda done, count: bar.update(task, completed=done, total=count,
                                              description=f'{done:,} of {count:,} {what}')
-
-
-@contextmanager
-def working(what: str) -> Iterator[None]:
-    """Show that work of unknown length goes on."""
-    if not sys.stderr.isatty():
-        yield
-        return
-    with Output(stderr=True).status(what):
-        yield
