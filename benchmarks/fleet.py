@@ -22,7 +22,8 @@ import time
 from typing import Any
 
 import accel_calib as ac
-from accel_calib.fleet import cluster, Input, Options, recordings, run, Store, Summary
+from accel_calib.fleet import (
+    changes_of, cluster, Input, Options, recordings, run, Store, Summary)
 from accel_calib.geometry import unit
 from accel_calib.logs import write_table
 from accel_calib.table import Floats
@@ -150,7 +151,7 @@ RIGHT = {'drifts': (f'the right drift within {LIMIT_SD:g} standard deviations', 
 
 def lines_of_changes(made: Sequence[Sensor], summary: Summary) -> Iterator[Line]:
     """Yield how many sensors of each kind are listed as changed, and whether rightly so."""
-    changed = {sensor for sensor, *_ in summary.changes}
+    changed = {sensor for sensor, *_ in changes_of(summary.sensors)}
     listed = {row['sensor']: row for row in summary.sensors if row['sensor'] in changed}
     kinds: dict[tuple[str, str], list[Sensor]] = defaultdict(list)
     for each in made:

@@ -231,15 +231,13 @@ def test_a_copy_counts_once_and_a_moved_recording_leaves_its_sensor(
         client: Any, tmp_path: Path) -> None:
     folder, store = write_fleet(tmp_path / 'in', 2, 2), Store(tmp_path / 'out')
     first, second = (folder / f'robot_{k}' / '2026-01-03.csv' for k in range(2))
+    copies = [folder / f'robot_{k}' / 'copy.csv' for k in range(2)]
     changes: list[tuple[Callable[[], Any], dict[str, int], list[int]]] = [
-        (lambda: shutil.copy(first, folder / 'robot_0' / 'copy.csv'), {'ok': 4, 'skipped': 1},
-         [2, 2]),
-        (lambda: shutil.copy(first, folder / 'robot_1' / 'copy.csv'), {'ok': 1, 'skipped': 5},
-         [2, 3]),
-        (lambda: None, {'skipped': 6}, [2, 3]),
-        (lambda: second.rename(folder / 'robot_0' / 'moved.csv'), {'ok': 1, 'skipped': 5},
+        (lambda: shutil.copy(first, copies[0]), {'ok': 4, 'skipped': 1}, [2, 2]),
+        (lambda: shutil.copy(first, copies[1]), {'ok': 1, 'skipped': 5}, [2, 3]),
+        (copies[0].unlink, {'skipped': 5}, [2, 3]),
+        (lambda: second.rename(folder / 'robot_0' / 'moved.csv'), {'ok': 1, 'skipped': 4},
          [3, 2]),
-        ((folder / 'robot_0' / 'copy.csv').unlink, {'skipped': 5}, [3, 2]),
         (lambda: first.rename(folder / 'moved.csv'), {'ok': 1, 'skipped': 4}, [2, 2])]
     for change, counts, rows in changes:
         change()

@@ -11,6 +11,7 @@ statistics, the typical values and the page of the fleet. `run` submits the task
 
 """
 
+from .overview import changes_of
 from .recording import Input, Options, recordings
 from .run import cluster, LIMIT_S, run, STATUS, Summary
 from .sensors import Store

@@ -127,12 +127,11 @@ def _local(text: str) -> Iterator[Input]:
 
 def _addresses(text: str) -> Iterator[Input]:
     """Yield the recordings of an address, in order."""
-    system, path = _system(text)
-    magic = '*[' if '://' in path else _MAGIC  # ? begins the query of an address of the web
-    root = PurePosixPath(path)
-    first = next((k for k, part in enumerate(root.parts) if set(part) & set(magic)), None)
-    files, folders = list[str](), [path]
-    with _as_input_error(text):
+    with _system(text) as (system, path):
+        magic = '*[' if '://' in path else _MAGIC  # ? begins the query of an address of the web
+        root = PurePosixPath(path)
+        first = next((k for k, part in enumerate(root.parts) if set(part) & set(magic)), None)
+        files, folders = list[str](), [path]
         if first is not None:
             root = PurePosixPath(*root.parts[:first])
             found = system.glob(path, detail=True).items()
@@ -148,20 +147,13 @@ def _addresses(text: str) -> Iterator[Input]:
 
 
 @contextmanager
-def _as_input_error(address: str) -> Iterator[None]:
-    """Raise InputError for the errors of a store, which have many types; OSError stays."""
-    try:
-        yield
-    except (AccelCalibError, OSError):
-        raise
-    except Exception as err:
-        raise InputError(f'{address} cannot be read: {err or type(err).__name__}, expected a '
-                         'store that answers', 'check the address, the network and the '
-                         'credentials, and run again') from err
+def _system(text: str) -> Iterator[tuple[Any, str]]:
+    """
+    Yield the file system of an address, and the path in it.
 
+    The errors of a store, which have many types, become InputError; OSError stays.
 
-def _system(text: str) -> tuple[Any, str]:
-    """Return the file system of an address, and the path in it."""
+    """
     try:
         from fsspec.core import url_to_fs
 
@@ -169,7 +161,14 @@ def _system(text: str) -> tuple[Any, str]:
     except (ImportError, ValueError) as err:
         raise InputError(f'{text} cannot be opened: {err}', 'install fsspec and its package for '
                          'this kind of address, such as s3fs for s3://') from err
-    return system, path
+    try:
+        yield system, path
+    except (AccelCalibError, OSError):
+        raise
+    except Exception as err:
+        raise InputError(f'{text} cannot be read: {err or type(err).__name__}, expected a store '
+                         'that answers', 'check the address, the network and the credentials, '
+                         'and run again') from err
 
 
 @contextmanager
@@ -180,10 +179,9 @@ def on_disk(path: str) -> Iterator[Path]:
     if '://' not in path:
         yield Path(path)
         return
-    system, inside = _system(path)
     with tempfile.TemporaryDirectory(prefix='accel_calib-') as folder:
-        local = Path(folder) / PurePosixPath(inside.partition('?')[0]).name
-        with _as_input_error(path):
+        with _system(path) as (system, inside):
+            local = Path(folder) / PurePosixPath(inside.partition('?')[0]).name
             system.get_file(inside, str(local))
         yield local
 

@@ -27,7 +27,7 @@ import threading
 import time
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from .overview import changes_of, digest_of, overview, priors_of, rating_of, write_fleet_page
+from .overview import digest_of, overview, priors_of, rating_of, write_fleet_page
 from .recording import (
     as_folder, content_hash, Input, key_of, on_disk, Options, Row, row_of, schema, unread_row)
 from .sensors import (
@@ -95,14 +95,13 @@ class Summary:
     What a run did.
 
     `counts` are the recordings by status (`STATUS`), and `sensors` the rows of all sensors.
-    `changes` are those of `changes_of`. `damaged` are damaged files of the results, under their
-    new names; their content was made again.
+    `damaged` are damaged files of the results, under their new names; their content was made
+    again.
 
     """
 
     counts: Counter[str]
     sensors: tuple[Row, ...]
-    changes: list[tuple[str, str, str, str]]
     damaged: tuple[str, ...]
     rating: Rating
 
@@ -240,7 +239,7 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         else:
             path.unlink(missing_ok=True)
         write_fleet_page(store, known, sensors, priors)
-        return Summary(counts, sensors, changes_of(sensors), damaged, rating_of(known, sensors))
+        return Summary(counts, sensors, damaged, rating_of(known, sensors))
 
 
 def _merge(client: Client, store: Store, own: tuple[OwnEffect, ...]) -> list[Row]:

@@ -34,7 +34,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-import errno
 import fcntl
 from hashlib import blake2b
 import json
@@ -194,9 +193,7 @@ class Store:
         with (self.folder / 'lock').open('w') as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as err:
-                if err.errno not in (errno.EAGAIN, errno.EACCES):
-                    raise
+            except BlockingIOError as err:
                 raise InputError(f'another program writes to {self.folder}, expected no other',
                                  'wait for it, or choose another folder') from err
             yield
@@ -211,7 +208,7 @@ class Store:
         return self.folder / 'done' / key[:2] / key
 
     def places(self, row: Row) -> dict[Path, list[str]]:
-        """Return the folders of sensors that had the recording of a row, or its content, by file."""
+        """Return, by file, the folders of sensors that had the recording, or its content."""
         found = {}
         for column in ('recording', 'content'):
             key = blake2b(row[column].encode(), digest_size=16).hexdigest()
