@@ -22,8 +22,7 @@ import time
 from typing import Any
 
 import accel_calib as ac
-from accel_calib.fleet import (
-    changes_of, cluster, Input, Options, recordings, run, Store, Summary)
+from accel_calib.fleet import changes_of, cluster, Input, Options, recordings, run, Store, Summary
 from accel_calib.geometry import unit
 from accel_calib.logs import write_table
 from accel_calib.table import Floats
