@@ -60,7 +60,7 @@ def state_of(results: Path) -> dict[str, Any]:
     # A worker that is killed while it writes leaves a hidden file.
     folders = {name: sorted(str(path.relative_to(results)) for path in (results / name).rglob('*')
                             if path.is_file() and not path.name.startswith('.'))
-               for name in ('calibrations', 'done', 'pending')}
+               for name in ('calibrations', 'done', 'pending', 'places')}
     return {'rows': rows, **folders,
             'sensors': pq.read_table(results / 'sensors.parquet').to_pylist(),
             'texts': [(results / name).read_text() for name in folders['calibrations']],

@@ -231,8 +231,8 @@ def test_a_reader_that_leaves_early_gets_no_error(tmp_path):
     assert 'Broken' not in done.stderr
 
 
-@pytest.mark.parametrize(('line', 'message'), table('not_piped'))
-def test_what_cannot_go_through_a_pipe_is_refused(line, message, tmp_path):
+@pytest.mark.parametrize(('line', 'message'), table('not_together'))
+def test_arguments_that_do_not_go_together_are_refused(line, message, tmp_path):
     (tmp_path / 'r.csv').write_text('time,ax,ay,az\n0,0,0,9.8\n', encoding='utf-8')
     done = forked(*line.split(), folder=tmp_path)
     assert done.returncode == 2

@@ -21,8 +21,8 @@ import numpy as np
 from rich.table import Table
 
 from .frame import (
-    check_target, console, Done, given, intake, log_options, Output, progress, read_lines,
-    rows_between, short_if_known, stored_calibration, table, Target)
+    check_target, console, Done, fleet_prior, given, intake, log_options, Output, progress,
+    read_lines, rows_between, short_if_known, stored_calibration, table, Target)
 from ..calibration import Calibration, NORM_MODELS
 from ..disk import STANDARD_OUTPUT, write_atomically
 from ..effects import AXES, entry_of, parse_effect
@@ -36,7 +36,7 @@ from ..pipeline import (
     calibrated, calibrated_log, captured_from, Correction, Intake, Outcome, Plan, ramp_or_poses,
     RampIntake, thermally_calibrated, ThermalOutcome)
 from ..stillness import CaptureSettings
-from ..stored import read_prior, write_calibration
+from ..stored import write_calibration
 from ..text import counted, listed, now, short, with_sd
 from ..units import MG
 
@@ -46,9 +46,10 @@ if TYPE_CHECKING:
 
 def run_fit(args: argparse.Namespace) -> Done:
     """Fit and store a calibration."""
+    plan = replace(plan_of(args), refined=False)
     with intake(args, args.poses) as found, progress('fitting'):
         rows = rows_between(found.poses, args.rows) if args.rows else None
-        outcome = calibrated(found.poses, found.units, plan_of(args, rows=rows, refined=False))
+        outcome = calibrated(found.poses, found.units, replace(plan, rows=rows))
     calibration = outcome.calibration
     ahead = outlook(calibration, args.model)
     return _store(
@@ -60,8 +61,9 @@ def run_fit(args: argparse.Namespace) -> Done:
 
 def run_calibrate(args: argparse.Namespace) -> Done:
     """Calibrate and store."""
+    plan = plan_of(args)
     with intake(args, args.log) as found, progress('fitting'):
-        outcome = calibrated_log(args.log, log_options(args), found, plan_of(args))
+        outcome = calibrated_log(args.log, log_options(args), found, plan)
     if isinstance(outcome, ThermalOutcome):
         return _store_thermal(args, [args.log], outcome,
                               'its temperature changes: fitted as by accel-calib thermal')
@@ -114,10 +116,10 @@ def _store_thermal(args: argparse.Namespace, logs: Sequence[Path], outcome: Ther
                      notes=lines))
 
 
-def plan_of(args: argparse.Namespace, **more: Any) -> Plan:
+def plan_of(args: argparse.Namespace) -> Plan:
     """Return how to calibrate; raise InputError if ``--prior`` stands with another model."""
-    fleet = args.prior and read_prior(args.prior, args.sensor_model)
-    plan = Plan(**{**given(Plan, args), 'fleet': fleet, 'also': args.own, **more})
+    fleet = fleet_prior(args)
+    plan = Plan(**{**given(Plan, args), 'fleet': fleet, 'also': args.own})
     usual = plan.model in ('auto', NORM_MODELS[-1]) and plan.method == 'ml'
     if fleet is not None and not usual:
         raise InputError(f'--prior with --model {plan.model} --method {plan.method}, expected '
@@ -254,11 +256,11 @@ def _refined(args: argparse.Namespace) -> 'tuple[Intake, Refinement]':
     """Refine with one log."""
     from ..refinement import refine  # a fit alone does not load the search
 
+    fleet = fleet_prior(args)
     stored = args.calibration and stored_calibration(args.calibration, args.own)
     with intake(args, args.poses, stored) as found, progress('refining'):
         poses = found.poses.take(rows_between(found.poses, args.rows))
-        base = (stored.in_units(found.units) if stored else
-                read_prior(args.prior, args.sensor_model) if args.prior else args.base)
+        base = stored.in_units(found.units) if stored else fleet or args.base
         return found, refine(poses, found.units, base=base, sensor=args.sensor, date=now(),
                              also=args.own)
 

@@ -39,7 +39,7 @@ from rich.text import Text
 
 from .commands import COMMANDS, next_command
 from .options import BAD_INPUT, plain_character, plain_handler, STANDARD_INPUT
-from ..calibration import Calibration
+from ..calibration import Calibration, FleetPrior
 from ..disk import BEFORE, replaceable, STANDARD_OUTPUT, write_atomically
 from ..effects import effects_of_file, OwnEffect
 from ..errors import AccelCalibError, InputError, known_error, RefusedFitError, saying
@@ -47,7 +47,7 @@ from ..findings import Rating, rating_json
 from ..logs import LogOptions, named_topics, OpenLog, Progress
 from ..pipeline import Intake, options_for, poses_of
 from ..stillness import CaptureSettings
-from ..stored import calibration_from, OF_FILE, read_calibration
+from ..stored import calibration_from, OF_FILE, read_calibration, read_prior
 from ..table import Poses
 from ..text import counted, plain, short
 
@@ -276,9 +276,8 @@ def _check_targets(args: argparse.Namespace, outputs: Sequence[Target],
             files = [target._replace(path=getattr(one, target.name),
                                      option=f'{target.option} for {one.poses}') for one in each]
         for file in files:
-            if not file.kind and not file.path.exists():
-                continue
-            check_target(file, inputs, force=args.force)
+            if file.kind or file.path.exists():
+                check_target(file, inputs, force=args.force)
             whole = Path(os.path.realpath(file.path))
             if whole in seen:
                 raise InputError(f'{seen[whole]} and {file.option} both name {file.path}, '
@@ -327,6 +326,16 @@ def log_options(args: argparse.Namespace, calibration: Calibration | None = None
     columns = {ours: theirs for each in args.columns for ours, theirs in each.items()}
     return options_for(calibration, LogOptions(**{
         **given(LogOptions, args), 'columns': columns, 'context': named_topics(args.context)}))
+
+
+def fleet_prior(args: argparse.Namespace) -> FleetPrior | None:
+    """Return the typical values of ``--prior``, if they are given."""
+    if args.prior is not None:
+        return read_prior(args.prior, args.sensor_model)
+    if args.sensor_model:
+        raise InputError('--sensor-model is given without --prior, expected both',
+                         'add --prior, or leave out --sensor-model')
+    return None
 
 
 @contextmanager
