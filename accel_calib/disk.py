@@ -28,9 +28,10 @@ STANDARD_OUTPUT = '-'
 
 FORMAT = 'accel_calib calibration'
 FIRST_LINE = f'format: {FORMAT}'
+"""Format of a stored calibration, and its first line, by which readers of logs know it."""
+
 BEFORE = rb'(?:\xef\xbb\xbf)?(?:\s|#[^\n]*\n|---)*'
 """What an editor or a person puts before the first line: a mark of the encoding, and comments."""
-"""Format of a stored calibration, and its first line, by which readers of logs know it."""
 
 _SUFFIX = '.tmp'
 _STALE_S = 3600.0
