@@ -158,7 +158,8 @@ class Sensor:
         """Noise of the samples: that of the calibration, or otherwise of the last rest."""
         if self.calibration is not None and self.calibration.noise is not None:
             return self.calibration.noise
-        return None if self.rest is None else SampleNoise(self.rest.std, self.rest.rate_std)
+        return None if self.rest is None else SampleNoise(*(
+            np.where(each > 0.0, each, np.nan) for each in (self.rest.std, self.rest.rate_std)))
 
     @property
     def has_changed(self) -> bool:

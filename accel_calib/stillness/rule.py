@@ -321,6 +321,7 @@ class Rule:
         noise[:3] = np.fmax(noise[:3], (STD_FLOOR_G * scale)**2)
         limit = self.limit_of(noise)
         judged['sums']['level'][:, :axes], judged['limit'][:, :axes] = recent.T, limit.T
+        judged['sums']['off'] = np.all(recent[3:] == 0.0, axis=0)
         judged['missing'], judged['trending'] = missing, self._trending(seen, mean, limit, scale)
         still = measured & (judged['trending'] == 0) & np.all(recent[:3] <= limit[:3], axis=0)
         still &= ~np.any(recent[3:] > limit[3:], axis=0)  # a rate can be NaN
