@@ -225,9 +225,10 @@ def test_robot_that_stands_for_hours_is_monitored_all_the_time(stored: Stored) -
     assert 1000.0 < left_at < 1800.0
 
 
-def test_pose_before_the_first_temperature_gets_that_of_the_next_pose() -> None:
-    live = book_of([(0.0, [0, 0, 1]), (10.0, [1, 0, 0], 31.0), (20.0, [0, 0, 1], 32.0)])
-    np.testing.assert_allclose(live.poses()['temperature'], [31.5, 31.0])
+def test_pose_without_a_temperature_gets_that_between_its_neighbours() -> None:
+    live = book_of([(0.0, [0, 0, 1]), (10.0, [1, 0, 0], 31.0), (17.5, [0, 1, 0]),
+                    (20.0, [0, 0, 1], 32.0)])
+    np.testing.assert_allclose(live.poses()['temperature'], [31.5, 31.0, 31.75])
     early = dwell(-500.0, [0, 1, 0])
     assert 'temperature' not in poses_from(with_temperature([early, *live._dwells]))
 
