@@ -317,7 +317,11 @@ class Rule:
         scale = np.asarray(self._per_g)
         if not self.known:
             calm = measured & np.all(recent <= self.limit_of(noise), axis=0)
-            scale = self._widen(np.where(calm, mean[:3], np.nan), noise[:3])
+            at_rest = np.where(calm, mean[:3], np.nan)
+            low = np.fmin.accumulate(np.column_stack([self._lowest, at_rest]), axis=1)[:, 1:]
+            high = np.fmax.accumulate(np.column_stack([self._highest, at_rest]), axis=1)[:, 1:]
+            self._lowest, self._highest = low[:, -1], high[:, -1]
+            scale = _half_range(low, high, noise[:3])
         noise[:3] = np.fmax(noise[:3], (STD_FLOOR_G * scale)**2)
         limit = self.limit_of(noise)
         judged['sums']['level'][:, :axes], judged['limit'][:, :axes] = recent.T, limit.T
@@ -328,13 +332,6 @@ class Rule:
         fastest = self._settings.still_gyro_max or math.inf
         judged['still'] = still & ~(np.sum(mean[3:]**2, axis=0) > fastest**2)
         return judged
-
-    def _widen(self, at_rest: Floats, noise: Floats) -> Floats:
-        """Return half the range at each chunk, with (3, n) native readings at rest, or NaN."""
-        low = np.fmin.accumulate(np.column_stack([self._lowest, at_rest]), axis=1)[:, 1:]
-        high = np.fmax.accumulate(np.column_stack([self._highest, at_rest]), axis=1)[:, 1:]
-        self._lowest, self._highest = low[:, -1], high[:, -1]
-        return _half_range(low, high, noise)
 
     def is_steep(self, slope: Floats, scale: Floats, variance: Floats, drift_g: float = SLOPE_G
                  ) -> Bools:
@@ -400,8 +397,7 @@ class Rule:
         return trending
 
     def _learn(self, seen: Stretch, mean: Floats, step: Floats, zero: Bools,
-               repeated: Bools, off: Bools
-               ) -> tuple[Floats, Bools]:
+               repeated: Bools, off: Bools) -> tuple[Floats, Bools]:
         """
         Return the variance of the noise at each chunk, and whether rests vary beyond rounding.
 
