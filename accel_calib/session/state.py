@@ -146,10 +146,8 @@ class Sensor:
         """
         stored = None if self.calibration is None else self.calibration.gyro
         now = None if self.rest is None else gyro_bias_of_rest(self.rest)
-        if now is None:
-            return stored
-        if stored is None:
-            return now
+        if now is None or stored is None:
+            return now or stored
         step = np.abs(now.bias - stored.at(now.temperature))
         return now if np.all(step < _LARGEST_BIAS_STEP) else stored
 

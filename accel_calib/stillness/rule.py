@@ -188,14 +188,12 @@ class Levels:
         self._counts = np.zeros((6, _BINS), np.int64)
         self._lowest = np.full((6, _BINS, 3), np.inf)
         self._highest = np.full((6, _BINS, 3), -np.inf)
-        self._found: Floats | None = np.zeros(6)
 
     def add(self, variance: Floats, reading: Floats) -> None:
         """Count (axes, n) variances of stretches, NaN if unknown, with (3, n) mean readings."""
         axis, which = np.nonzero(np.isfinite(variance))
         if not len(axis):
             return
-        self._found = None
         with np.errstate(divide='ignore'):
             level = np.floor(np.log2(variance[axis, which])) + _ZERO
         found = axis, np.clip(level, 0, _BINS - 1).astype(np.intp)
@@ -206,26 +204,25 @@ class Levels:
     @property
     def least(self) -> Floats:
         """Return the (6,) variances at rest where something was far quieter; 0 elsewhere."""
-        if self._found is None:
-            self._found = np.zeros(6)
-            for axis, counts in enumerate(self._counts):
-                lowest, highest = self._lowest[axis], self._highest[axis]
-                near = np.convolve(counts, np.ones(2 * _NEAR + 1), 'same')
-                most = int(np.argmax(near))
-                rests = slice(max(most - _NEAR, 0), most + _NEAR + 1)
-                peak = rests.start + int(np.argmax(counts[rests]))
-                quieter = slice(1, max(peak - _BELOW, 1))
-                count = int(np.sum(counts[quieter]))
-                if not (count + counts[0] and max(count * _RARE, counts[0]) < near[most]):
-                    continue
-                low, high = lowest[rests].min(axis=0), highest[rests].max(axis=0)
-                turned = np.max(high - low)
-                way = np.max(highest[quieter].max(axis=0, initial=-np.inf)
-                             - lowest[quieter].min(axis=0, initial=np.inf))
-                size = np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
-                if turned > _TURNED * size and way < _ONE_WAY * turned:
-                    self._found[axis] = 2.0**(peak - _ZERO)
-        return self._found
+        found = np.zeros(6)
+        for axis, counts in enumerate(self._counts):
+            lowest, highest = self._lowest[axis], self._highest[axis]
+            near = np.convolve(counts, np.ones(2 * _NEAR + 1), 'same')
+            most = int(np.argmax(near))
+            rests = slice(max(most - _NEAR, 0), most + _NEAR + 1)
+            peak = rests.start + int(np.argmax(counts[rests]))
+            quieter = slice(1, max(peak - _BELOW, 1))
+            count = int(np.sum(counts[quieter]))
+            if not (count + counts[0] and max(count * _RARE, counts[0]) < near[most]):
+                continue
+            low, high = lowest[rests].min(axis=0), highest[rests].max(axis=0)
+            turned = np.max(high - low)
+            way = np.max(highest[quieter].max(axis=0, initial=-np.inf)
+                         - lowest[quieter].min(axis=0, initial=np.inf))
+            size = np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
+            if turned > _TURNED * size and way < _ONE_WAY * turned:
+                found[axis] = 2.0**(peak - _ZERO)
+        return found
 
 
 class Rule:
