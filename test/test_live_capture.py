@@ -80,8 +80,7 @@ def test_rest_counts_before_it_ends_and_its_final_average_replaces_it(readings: 
     counts = [change.rest.samples for change in changes if change.poses]
     assert len(live.poses()) == 1
     assert counts == sorted(counts)
-    assert counts[0] < 80
-    assert counts[-1] > 150
+    assert counts[0] < 80 < 150 < counts[-1]
     live = LiveCapture(CaptureSettings(repeated='keep'), MPS2)
     changes = push_all(live, readings(FACES, dwell=2.0))
     assert len(live.poses()) == 3
@@ -157,35 +156,27 @@ def test_change_is_reported_during_the_third_rest_and_survives_a_new_level(store
         reading = calibration.predict(np.array([[0.0, 0.0, (1.0 + off) * GRAVITY]]))[0]
         return dwell(time, reading / GRAVITY)
 
-    for time, off in ((0.0, 0.0), (10.0, 0.05), (20.0, 0.0), (30.0, 0.005), (40.0, 0.005)):
-        sensor = sensor.update(rest(time, off), 0.001)
-        sensor = sensor.update(rest(time, off), 0.001, ended=True)
-        assert sensor.drift.change is None
-    sensor = sensor.update(rest(50.0, 0.005), 0.001)
-    assert sensor.drift.change is not None
-    sensor = sensor.update(rest(50.0, 0.0), 0.001)
-    assert sensor.drift.change is not None  # what is reported stays for rests without it
-    sensor = sensor.update(rest(50.0, 0.005), 0.001, ended=True)
-    assert sensor.drift.change is not None
+    rests = [(10.0 * k, off, ended) for k, off in enumerate((0.0, 0.05, 0.0, 0.005, 0.005))
+             for ended in (False, True)]  # what is reported stays for rests without it
+    for time, off, ended in [*rests, (50, 0.005, False), (50, 0.0, False), (50, 0.005, True)]:
+        sensor = sensor.update(rest(time, off), 0.001, ended=ended)
+        assert sensor.has_changed is (time == 50)
     assert sensor.drift.count == 6
     flat = calibration.predict(np.array([[0.0, 0.6, 0.8]]) * GRAVITY)[0]
     sensor = sensor.adopt(level(calibration, flat, 'ros'))
-    assert sensor.drift.change is not None
-    sensor = sensor.adopt(None)
-    assert sensor.drift is None
+    assert sensor.has_changed
+    assert sensor.adopt(None).drift is None
 
 
 def test_rest_that_is_reported_late_does_not_hide_the_ongoing_rest(stored: Stored) -> None:
-    _, sensor = monitored(stored)
+    (_, sensor), counts = monitored(stored), []
     early, late = dwell(0.0, [0, 0, 1]), dwell(10.0, [0, 0, 1.01])
-    sensor = sensor.update(early, 0.001)
-    sensor = sensor.update(late, 0.001)
-    sensor = sensor.update(early, 0.001, ended=True)
-    assert sensor.drift.count == 2
-    sensor = sensor.update(late, 0.001, ended=True)
-    assert sensor.drift.count == 2
-    sensor = sensor.update(replace(late, end=late.end + 1e3), 0.001)  # by a clock that has jumped
-    assert sensor.drift.count == 2
+    jumped = replace(late, end=late.end + 1e3)  # by a clock
+    for rest, ended in ((early, False), (late, False), (early, True), (late, True),
+                        (jumped, False)):
+        sensor = sensor.update(rest, 0.001, ended=ended)
+        counts.append(sensor.drift.count)
+    assert counts[2:] == [2, 2, 2]
 
 
 def test_remainder_of_a_rest_is_what_came_after_its_part() -> None:
@@ -199,10 +190,8 @@ def test_remainder_of_a_rest_is_what_came_after_its_part() -> None:
     rest = rest_after(part, whole)
     np.testing.assert_allclose(rest.mean, second.mean(axis=0))
     assert (rest.start, rest.end, rest.samples) == (2.0, 3.0, 100)
-    assert rest.count == pytest.approx(50.0)
     np.testing.assert_array_equal(rest.std, np.ones(3))
-    assert rest.time == pytest.approx(2.5)
-    assert rest.context['temperature'] == pytest.approx(26.0)
+    assert (rest.count, rest.time, rest.context['temperature']) == pytest.approx((50.0, 2.5, 26.0))
 
 
 def test_robot_that_stands_for_hours_is_monitored_all_the_time(stored: Stored) -> None:
@@ -212,22 +201,21 @@ def test_robot_that_stands_for_hours_is_monitored_all_the_time(stored: Stored) -
     base = calibration.predict(np.array([[0.0, 0.0, GRAVITY]]))[0]
     for k in range(0, 4 * 2000, 40):  # at 4 Hz; the offset begins to change after 1000 s
         time = (k + np.arange(40)) / 4.0
-        shift = GRAVITY * 0.00001 * np.maximum(0.0, time - 1000.0)
         readings = base + 0.01 * rng.normal(size=(40, 3))
-        readings[:, 2] += shift
+        readings[:, 2] += GRAVITY * 0.00001 * np.maximum(0.0, time - 1000.0)
         for change in push_all(live, readings, start=time[0], rate=4.0, capture=False, block=40):
             if change.rest is not None:
                 sensor = sensor.update(change.rest, 0.001)
-        if sensor.drift.change is not None:
-            left_at = left_at or time[0]
+        left_at = left_at or time[0] * sensor.has_changed
         counts.append(sensor.drift.count)
     assert max(counts) >= 5  # long rests are compared in parts of 5 minutes
     assert 1000.0 < left_at < 1800.0
 
 
-def test_pose_before_the_first_temperature_gets_that_of_the_next_pose() -> None:
-    live = book_of([(0.0, [0, 0, 1]), (10.0, [1, 0, 0], 31.0), (20.0, [0, 0, 1], 32.0)])
-    np.testing.assert_allclose(live.poses()['temperature'], [31.5, 31.0])
+def test_pose_without_a_temperature_gets_that_between_its_neighbours() -> None:
+    live = book_of([(0.0, [0, 0, 1]), (10.0, [1, 0, 0], 31.0), (17.5, [0, 1, 0]),
+                    (20.0, [0, 0, 1], 32.0)])
+    np.testing.assert_allclose(live.poses()['temperature'], [31.5, 31.0, 31.75])
     early = dwell(-500.0, [0, 1, 0])
     assert 'temperature' not in poses_from(with_temperature([early, *live._dwells]))
 
@@ -252,10 +240,8 @@ def test_poses_of_a_noisier_time_are_marked_and_kept() -> None:
             changes += push_all(live, np.vstack([moving, held]), start=start)
             start += 4.0
     poses = live.poses()
-    doubted = sum(change.doubted for change in changes)
-    assert len(poses) == 24
-    assert doubted == np.sum(poses['doubtful']) == 12
-    assert np.all(poses['doubtful'][:12] == 1.0)
+    assert poses['doubtful'].tolist() == [1.0] * 12 + [0.0] * 12
+    assert sum(change.doubted for change in changes) == 12
     calibration = fit_poses(poses, MPS2, model='10')
     assert [each.row for each in calibration.rejected] == list(range(1, 13))
     assert list(calibration.used_poses.row) == list(range(13, 25))

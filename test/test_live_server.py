@@ -34,14 +34,6 @@ UPGRADE = 'Upgrade: websocket\r\nConnection: Upgrade\r\n'
 VERSION = 'Sec-WebSocket-Version: 13\r\n'
 
 
-def turned_to(directions: Floats) -> Floats:
-    """Return the samples of a sensor that is turned; its temperature is 21 °C."""
-    recording = simulate_recording(
-        model_with({'offset': np.array(OFFSET)}), directions, np.random.default_rng(7),
-        noise_g=0.0005, rate_hz=50.0, dwell=1.8, turn=0.4)
-    return rows_of(recording['time'], recording.reading * GRAVITY, temperature=21.0)
-
-
 def played(rows: Floats, over: Event) -> Iterator[Floats]:
     """Yield rows in blocks, faster than real time."""
     for block in np.array_split(rows, max(1, len(rows) // 40)):
@@ -56,8 +48,11 @@ class Bench:
     def __init__(self, stack: ExitStack, folder: Path, poses: int = 1,
                  blocks: Callable[[Floats, Event], Iterator[Floats]] = played) -> None:
         self._stack, self.path, self.played = stack, folder / 'c.yaml', Event()
-        source = Source('bench.csv', 'imu_link', MPS2, '',
-                        blocks(turned_to(spread_directions(poses)), self.played))
+        turned = simulate_recording(
+            model_with({'offset': np.array(OFFSET)}), spread_directions(poses),
+            np.random.default_rng(7), noise_g=0.0005, rate_hz=50.0, dwell=1.8, turn=0.4)
+        rows = rows_of(turned['time'], turned.reading * GRAVITY, temperature=21.0)
+        source = Source('bench.csv', 'imu_link', MPS2, '', blocks(rows, self.played))
         self.host, self.logged = stack.enter_context(
             hosted(source, calibration_file=str(self.path)))
         self.base = self.host.server.link.partition('/#')[0]

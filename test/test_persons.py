@@ -14,7 +14,7 @@ from typing import Any
 
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.session import (
-    BUTTONS, conditions, diagnostics, enable, figures as health_figures, next_step, progress,
+    BUTTONS, conditions, diagnostics, enable, figures as health_figures, next_step, progress, run,
     Surroundings, words_of_state)
 from driven import Driver, GRAVITY, Person
 from inside import spread_directions
@@ -223,7 +223,7 @@ def test_a_refusal_that_passes_with_the_moment_is_no_next_step() -> None:
     assert step.command == 'set_level'
 
 
-def test_no_step_is_named_while_the_rating_is_being_computed() -> None:
+def test_no_step_is_named_while_it_is_being_computed_and_poses_are_counted_at_once() -> None:
     driver = Driver(sensor='rated')
     person = Person(driver, reading())
     for up in spread_directions(16):
@@ -235,6 +235,13 @@ def test_no_step_is_named_while_the_rating_is_being_computed() -> None:
     action = next_step(driver.session.state)
     assert (action.kind, action.text) == ('', '')
     assert not [line.words for line in driver.log[lines:] if 'next: ' in line.words]
+    driver.ask('fit')
+    fit, count = run(driver.session, 'fit'), progress(driver.session.state).poses
+    next(fit)
+    driver.handle = lambda: None  # the choice of the next pose waits for the fit
+    person.rest([-0.9, 0.4, 0.2])
+    now = progress(driver.session.state)
+    assert (now.poses, now.step) == (count + 1, '')
 
 
 def test_a_step_offers_no_fit_of_the_same_poses_and_names_a_pose_after_each_refusal() -> None:
@@ -282,6 +289,21 @@ def test_a_sensor_at_rest_does_not_turn_and_a_quick_turn_does_not_remove_gravity
         feed([[0.0, 0.0, 1.0]] * 20)
     angle = np.linspace(0.0, np.pi, 15)
     feed(np.column_stack([np.sin(angle), 0.0 * angle, np.cos(angle)]))
+
+
+def test_a_fault_of_the_readings_is_not_one_of_the_calibration_and_no_gyro_has_no_bias() -> None:
+    driver, up = Driver(), GRAVITY * np.array([[0.0, 0.0, 1.0]] * 200)
+    driver.feed(up, rate=0.0)
+    assert 'gyro' not in driver.ask('calibrate_at_rest')
+    words = dict(health_figures(driver.session.state))
+    assert 'gyro bias [rad/s]' not in words
+    assert 'not known' in words['noise of angular velocity [rad/s]']
+    for scale in (0.002, 8.0):
+        driver.feed(scale * up)
+        driver.session.drop('implausible', 'error', '')
+        driver.tick()
+        assert conditions(driver.session.state)[0].kind == 'unit'
+        assert not re.search('calibration|native', driver.finding('stream').words)
 
 
 # Persons who can do it
@@ -386,13 +408,10 @@ def test_an_upside_down_sensor_is_asked_about_once_unless_its_mounting_is_given(
 def test_an_effect_far_beyond_those_of_parts_is_reported_and_not_used() -> None:
     driver = Driver()
     driver.session.change(surroundings=Surroundings(thermometers=('/board/temperature', '/cpu')))
-
-    def unseen(up: Any, temperature: float) -> Any:
-        return healthy(up, temperature) + 3.0 * EFFECT * (temperature - 25.0)
-
     feed = driver.feed
     driver.feed = lambda readings, temperature: feed(readings)
-    person = Person(driver, unseen, warming=1.2)
+    person = Person(driver, lambda up, warm: healthy(up, warm) + 3.0 * EFFECT * (warm - 25.0),
+                    warming=1.2)
     for up in spread_directions(24)[np.random.default_rng(2).permutation(24)]:
         person.rest(up)
     driver.ask('fit')
@@ -405,11 +424,8 @@ def test_an_effect_far_beyond_those_of_parts_is_reported_and_not_used() -> None:
 
 def test_an_effect_of_time_does_not_warn_for_ever() -> None:
     driver = Driver()
-
-    def stepping(up: Any, temperature: float) -> Any:
-        return (1.01 if driver.stamp > 1030.0 else 1.0) * np.asarray(healthy(up, temperature))
-
-    person = Person(driver, stepping)
+    person = Person(driver, lambda up, warm: healthy(up, warm) * (
+        1.01 if driver.stamp > 1030.0 else 1.0))
     for up in spread_directions(30)[np.random.default_rng(3).permutation(30)]:
         person.rest(up)
     driver.ask('refine')

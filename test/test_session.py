@@ -343,11 +343,6 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
 # Frames
 
 
-def applied(driver: Driver) -> Any:
-    """Return the rotation of messages."""
-    return driver.session.state.on_topics(driver.calibration).rotation
-
-
 @pytest.mark.parametrize('frame', ['ned', 'win8'])
 def test_a_stored_mounting_of_the_documents_is_turned_before_it_is_used(
         stored: Stored, frame: Any) -> None:
@@ -356,7 +351,8 @@ def test_a_stored_mounting_of_the_documents_is_turned_before_it_is_used(
     flat, nose_down = found.predict(np.array([UP, NOSE_DOWN]) @ MOUNTING.T * GRAVITY)
     write_calibration(path, set_heading(level(found, flat, frame), nose_down))
     driver = Driver(calibration_file=str(path), frame='ned')
-    np.testing.assert_allclose(applied(driver), MOUNTING @ np.diag([1.0, -1.0, -1.0]), atol=1e-6)
+    applied = driver.session.state.on_topics(driver.calibration).rotation
+    np.testing.assert_allclose(applied, MOUNTING @ np.diag([1.0, -1.0, -1.0]), atol=1e-6)
     assert f'frame {frame},' in driver.logged('warning')
 
 

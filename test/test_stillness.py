@@ -201,7 +201,7 @@ def test_a_gyro_decides_whether_a_short_noisy_rest_turns_slowly():
     assert rests_found(rests, 0.05) == list(range(8))
     assert rests_found(turned_one, 0.05, turning=1.0) == [0, 1, 2, 3, 4, 6, 7]
     for value in (0.0, 0.0123, -0.7):  # a driver that gets no rates for a while
-        assert {0, 1, 5, 6, 7} <= {*rests_found(rests, 0.005, value=value)}
+        assert rests_found(rests, 0.005, value=value) == list(range(8))
 
 
 def test_a_gyro_that_says_turning_overrules_a_steady_reading():
@@ -268,7 +268,6 @@ def test_the_ongoing_dwell_is_available_before_it_ends():
     assert detector.current() is None
     detector.push(rows(time[80:], reading[80:], temperature=21.0))
     dwell = detector.current()
-    assert dwell is not None
     assert dwell.samples > 300
     assert dwell.context['temperature'] == pytest.approx(21.0)
     assert detector.dwells() == []

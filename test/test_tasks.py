@@ -79,7 +79,7 @@ def test_a_fit_is_discarded_if_another_command_has_changed_the_calibration_meanw
     for other in ('fit', 'calibrate_at_rest', 'load', 'undo', 'reset'):
         with pytest.raises(AccelCalibError, match='another command changed the calibration'):
             asked_during_a_fit(other)
-        assert state() == after[-1]
+        assert (state(), driver.session.state.refusal_of('fit')) == (after[-1], '')
     assert driver.session.state.computing == 0
 
 

@@ -212,9 +212,9 @@ def gyro_bias_of(poses: Poses) -> GyroBias | None:
 
 
 def gyro_bias_of_rest(rest: Dwell) -> GyroBias | None:
-    """Return the bias of the gyro from one rest; None without a plausible angular rate."""
-    rate = rest.context.get('rate')
-    if rate is None or not np.all(np.isfinite(rest.rate_std)) or np.any(
+    """Return the bias of the gyro from one rest; None if its rate is all 0 or not plausible."""
+    rate = rest.context.get('rate', 0.0)
+    if not np.any(rate) or not np.all(np.isfinite(rest.rate_std)) or np.any(
             np.abs(rate) > _LARGEST_AT_REST):
         return None
     temperature = float(np.asarray(rest.context.get('temperature', math.nan)))

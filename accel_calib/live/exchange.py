@@ -296,8 +296,7 @@ class Board:
 
     newest: dict[str, Message] = field(default_factory=dict)
     lines: deque[Message] = field(default_factory=lambda: deque(maxlen=_LINES))
-    history: deque[Message] = field(
-        default_factory=lambda: deque(maxlen=int(_HISTORY_S / PERIOD)))
+    history: deque[Message] = field(default_factory=lambda: deque(maxlen=int(_HISTORY_S / PERIOD)))
 
 
 class TooManyError(InputError):

@@ -88,8 +88,7 @@ def pose_markers(directions: Floats, step: NextStep, frame_id: str) -> MarkerArr
         arrow.type, arrow.scale.y, arrow.scale.z = Marker.ARROW, 2.0 * _SHAFT, 2.0 * _SHAFT
         arrow.points = [Point(), Point(**dict(zip('xyz', up.tolist())))]
         markers.append(arrow)
-    markers.append(_marker('next', 1, _WORDS, _LETTER, up * _WORDS_AT,
-                           text=step.text))
+    markers.append(_marker('next', 1, _WORDS, _LETTER, up * _WORDS_AT, text=step.text))
     for marker in markers:
         marker.header.frame_id = frame_id
     return MarkerArray(markers=markers)
@@ -364,15 +363,12 @@ class ManagedCalibrator(LifecycleNode):
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close the files and remove all topics and services."""
         self.close()
-        for kinds, destroy in ((self.publishers, self.destroy_publisher),
-                               (self.subscriptions, self.destroy_subscription),
-                               (self.services, self.destroy_service),
-                               (self.timers, self.destroy_timer)):
-            for each in list(kinds):
+        for kind in ('publisher', 'subscription', 'service', 'timer'):
+            for each in list(getattr(self, f'{kind}s')):
                 if each not in self._own:
                     # The executor calls these for the events that it has already received.
                     each.callback = each.send_response = lambda *given: None
-                    destroy(each)
+                    getattr(self, f'destroy_{kind}')(each)
         return TransitionCallbackReturn.SUCCESS
 
     on_shutdown = on_cleanup

@@ -124,8 +124,7 @@ class ContextTopics:
                 found = f'there is no topic {topic}: start its driver, or' if not kinds else (
                     f'{topic} has the type {names} with {have}, '
                     f'expected {field or "one, or its name after the topic"}:')
-                self._missing[column] = (
-                    f'{found} correct context, and restart the node{usable}')
+                self._missing[column] = f'{found} correct context, and restart the node{usable}'
                 continue
             del self._waiting[column]
             value = operator.attrgetter(read)

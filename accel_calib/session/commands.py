@@ -43,7 +43,7 @@ _AUTO_FIT_EVERY = 60.0
 
 
 class ChangedError(AccelCalibError):
-    """The calibration changed during a fit or a refinement."""
+    """The sensor or the calibration changed during a command, which may work the next time."""
 
 
 class NoRestError(InputError):
@@ -59,7 +59,7 @@ def run(session: Holder, name: str, *, offers: bool = False) -> Task:
         if isinstance(found, Fitted):
             found = yield from _use(session, found, offers=offers)
     except AccelCalibError as error:
-        if not isinstance(error, NoRestError):
+        if not isinstance(error, NoRestError | ChangedError):
             session.refuse(name, str(error))
         raise
     return found
@@ -373,9 +373,9 @@ def _alone(session: Holder, step: Parse) -> Part[Any]:
     sensor, name = session.sensor, session.state.name
     found = yield step
     if session.sensor.live is not sensor.live:
-        raise InputError(f'the sensor {session.state.name!r} has replaced {name!r} meanwhile, '
-                         'expected one sensor: the result is not used',
-                         'call the service again')
+        raise ChangedError(f'the sensor {session.state.name!r} has replaced {name!r} meanwhile, '
+                           'expected one sensor: the result is not used',
+                           'call the service again')
     return found
 
 

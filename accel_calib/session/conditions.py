@@ -168,7 +168,8 @@ def _ordinary_step(state: State) -> Finding:
     if sensor.drift is not None and sensor.has_changed:
         return Finding('changed', status(sensor.drift), level='USABLE', step='poses',
                        command=sensor.drift.remedy[1])
-    if sensor.calibration is not None and rating is None:
+    is_new = guide.count != guide.poses  # the next pose is chosen after the computation
+    if (sensor.calibration is not None and rating is None) or (state.computing and is_new):
         return _step('', '')
     if rating is not None and rating.name == 'GOOD':
         is_done = sensor.calibration is None or sensor.calibration.is_levelled
@@ -312,10 +313,13 @@ def _check_stream(state: State) -> list[Finding]:
         found['unit'] = f'|a| is {length:.3g} g, expected about 1 g at rest: ' + (
             'this is linear acceleration, gravity removed: let the driver publish what the '
             'accelerometer reads' if length < _WITHOUT_GRAVITY_G else
+            'its rests were about 1 g before: correct the range or the unit of the driver'
+            if likely == 'native' and (state.sensor.present or state.sensor.guide.count) else
             _restart(state, 'units', likely))
     if statistics.dropped_ago < _LASTS:
         found |= {kind: f'dropped {counted(statistics.dropped[kind], what)} {why}'
-                  for kind, (what, why) in _DROPPED.items() if statistics.dropped[kind]}
+                  for kind, (what, why) in _DROPPED.items() if statistics.dropped[kind]
+                  and not (is_wrong and kind == 'implausible')}  # it is not the calibration
     limit, spread = live.detector.threshold, statistics.shaken(units.per_g)
     if math.isfinite(limit) and spread > limit and not (
             is_wrong or live.still or units.is_native):  # stays in one direction, but no rest
@@ -450,7 +454,8 @@ def progress(state: State, reading: Triple | None = None) -> Progress:
         still=state.still and not silent,
         stillness=math.nan if silent else statistics.spread / sensor.live.detector.threshold,
         dwell=statistics.stamp - state.still_since if state.still else 0.0,
-        min_dwell=state.settings.min_dwell, poses=sensor.guide.poses,
+        min_dwell=state.settings.min_dwell,
+        poses=sensor.guide.count if state.computing else sensor.guide.poses,
         total=0 if plan is None else plan.asked.total,
         coverage=0.0 if plan is None else plan.coverage,
         accuracy=math.nan if plan is None or noisy else plan.asked.error * plan.noise_g,
@@ -572,7 +577,7 @@ def figures(state: State) -> Iterator[tuple[str, str]]:
 
 
 def _vector(values: Iterable[float]) -> str:
-    return ', '.join(f'{value:.4g}' for value in values)
+    return ', '.join(f'{value:.4g}' if math.isfinite(value) else 'not known' for value in values)
 
 
 def _number(value: float) -> str:

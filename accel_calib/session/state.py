@@ -146,10 +146,8 @@ class Sensor:
         """
         stored = None if self.calibration is None else self.calibration.gyro
         now = None if self.rest is None else gyro_bias_of_rest(self.rest)
-        if now is None:
-            return stored
-        if stored is None:
-            return now
+        if now is None or stored is None:
+            return now or stored
         step = np.abs(now.bias - stored.at(now.temperature))
         return now if np.all(step < _LARGEST_BIAS_STEP) else stored
 
@@ -158,7 +156,8 @@ class Sensor:
         """Noise of the samples: that of the calibration, or otherwise of the last rest."""
         if self.calibration is not None and self.calibration.noise is not None:
             return self.calibration.noise
-        return None if self.rest is None else SampleNoise(self.rest.std, self.rest.rate_std)
+        return None if self.rest is None else SampleNoise(*(
+            np.where(each > 0.0, each, np.nan) for each in (self.rest.std, self.rest.rate_std)))
 
     @property
     def has_changed(self) -> bool:

@@ -158,10 +158,8 @@ class Store:
         """Return whether the present file can be used, or does not exist."""
         try:
             self.load_calibration()
-        except AccelCalibError:
-            return False
-        except OSError as error:
-            if error.errno not in _UNREADABLE:
+        except (AccelCalibError, OSError) as error:
+            if isinstance(error, OSError) and error.errno not in _UNREADABLE:
                 raise
             return False
         return True

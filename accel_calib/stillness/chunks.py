@@ -140,6 +140,7 @@ def chunk_type(columns: int) -> np.dtype[Any]:
         ('at_limit', float, 3),             # samples that repeat the extreme of the axis so far
         ('repeats', float),                 # samples that repeat the one before in the chunk
         ('zeros', float),                   # samples that are zero on all axes
+        ('off', float),                     # windows in which the gyro does not vary
         ('context_count', float, (columns,)),  # samples that have the context
         ('context_sum', float, (columns,)),
         ('level', float, 6),                # variance of the window at each chunk; NaN: no rate

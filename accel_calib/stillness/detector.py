@@ -35,7 +35,7 @@ from ..table import ABOUT, CONTEXT, Floats, numbered, Poses, Recording
 from ..units import Units
 
 _SAME_TEMPERATURE = 120.0
-"""Rests within this time are assumed to have the same temperature [s]."""
+"""Longest time to a rest with a temperature, by which a missing one is interpolated [s]."""
 
 _BLOCK = 1 << 14     # samples summed at a time; they fit in the cache
 _AT_ONCE = 1 << 17   # samples passed to the detector at a time
@@ -421,17 +421,14 @@ def rest_after(part: Dwell, whole: Dwell) -> Dwell:
 
 
 def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
-    """Return dwells with missing temperatures set to that of the nearest one; tables need all."""
-    known = [dwell for dwell in dwells if 'temperature' in dwell.context]
-    found, times = [], np.array([dwell.time for dwell in known])
-    for dwell in dwells:
-        away = np.abs(times - dwell.time)
-        is_near = np.min(away, initial=np.inf) <= _SAME_TEMPERATURE
-        if is_near and 'temperature' not in dwell.context:
-            warm = known[int(np.argmin(away))].context['temperature']
-            dwell = replace(dwell, context={**dwell.context, 'temperature': warm})
-        found.append(dwell)
-    return found
+    """Return dwells with missing temperatures interpolated; tables need all."""
+    known = sorted((dwell.time, float(np.asarray(dwell.context['temperature'])))
+                   for dwell in dwells if 'temperature' in dwell.context)
+    times, warm = np.reshape(known, (-1, 2)).T
+    return [replace(each, context={
+        **each.context, 'temperature': float(np.interp(each.time, times, warm))})
+        if 'temperature' not in each.context and np.any(
+            np.abs(times - each.time) <= _SAME_TEMPERATURE) else each for each in dwells]
 
 
 def overlap(one: Dwell | Rest, other: Dwell) -> bool:

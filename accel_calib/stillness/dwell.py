@@ -115,6 +115,7 @@ _FIGURES = [
     ('along', float),         # the same along the mean reading, if that is the vertical
     ('beside_slope', bool),   # the reading has a slope directly before or after
     ('short', bool),          # shorter than `min_dwell`
+    ('off', bool),            # the gyro does not vary in a window
     ('at_limit', float, 3),   # share of samples that repeat the extreme of an axis so far
     ('orientation', np.intp),
     ('part_slope', float, 3), ('part_strength', float, 3)]  # first, middle and last half
@@ -137,6 +138,7 @@ def figures(dwell: OngoingDwell, *, known_units: bool) -> Records:
         found[name] = getattr(dwell, name)
     found['time'] = dwell.epoch + total['time'] / count
     found['samples'], found['at_limit'] = count, total['at_limit'] / count
+    found['off'] = total['off'] > 0.0
     found['around'] = np.where(known > 0.0, total['context_sum'], np.nan) / np.maximum(known, 1.0)
 
     cells, spacing = dwell.cells, dwell.size * dwell.length
@@ -286,7 +288,8 @@ def _reasons(table: Records, rule: Rule, tiny: Floats
 
     `tiny` is the standard deviation of each below which it repeats one reading. The bias of the
     gyro is the median over the quiet dwells. A rate about the vertical does not change a pose and
-    is ignored. A gyro beside native readings may be in counts and is not used.
+    is ignored. Not used are a gyro that was off during a dwell, and one beside native readings,
+    which may be in counts.
 
     """
     mean, slope, average, scale = table['mean'].T, table['slope'].T, table['average'].T, rule.scale
@@ -304,7 +307,7 @@ def _reasons(table: Records, rule: Rule, tiny: Floats
     common = np.median(own[:, quiet], axis=1, keepdims=True) if quiet.any() else 1.0
     across, along = np.maximum(np.maximum(common, 1.0), own / _OWN_EXCESS)
     up, rates = mean[:3], mean[3:]
-    known = quiet & np.isfinite(rates).all(axis=0)
+    known = quiet & np.isfinite(rates).all(axis=0) & ~table['off']
     found['turning'] = sure = np.zeros_like(quiet)
     if rule.known and known.sum() >= _BIAS_DWELLS:
         off = rates - np.median(rates[:, known], axis=1, keepdims=True)
@@ -313,7 +316,7 @@ def _reasons(table: Records, rule: Rule, tiny: Floats
                    / np.maximum(np.linalg.norm(up, axis=0), 1e-300))
         found['turning'] = known & (tilting > max(_GYRO_RATE, 2.0 * _SPREADS * spread))
         sure = known & (tilting < _GYRO_RATE) & (_SPREADS * spread < _GYRO_RATE)
-        sure &= np.all(average[3:] > 0.0, axis=0)  # else the gyro is off
+        sure &= np.all(average[3:] > 0.0, axis=0)  # else an axis is off
     turn = np.sqrt(np.sum(slope**2, axis=0)) + SURE * table['error'] * np.sqrt(across)
     found['noisy'] = ~sure & ~((turn < TURN_G * scale) | (scale == 0.0))
     good = ~np.any(list(found.values()), axis=0)

@@ -174,8 +174,7 @@ def trend_of(values: Floats, length: int, spacing: float, white: Floats) -> Tren
     excess = power * (1.0 + correlation) / (1.0 - correlation)
     slope, time_square = step / spacing, time_square * spacing**2
     strength = np.sum(slope * slope * weight, axis=0) * time_square / excess
-    return Trend(slope, square, strength, excess,
-                 np.sqrt(np.max(white, axis=0) / time_square))
+    return Trend(slope, square, strength, excess, np.sqrt(np.max(white, axis=0) / time_square))
 
 
 def excess_of_means(centred: Floats, white: Floats) -> float:
