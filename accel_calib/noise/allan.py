@@ -55,7 +55,8 @@ are seen; N, B and K always, because neighbours have similar slopes.
 **Uncertainty.** The interval of the squared size is that of a χ² variable with edf = 2 size⁴ /
 variance. If the components do not describe the curve, such as beside a vibration, variance is
 multiplied by χ² per degree of freedom [4]_. In simulated rests, 95 % intervals hold the true value
-in 93 to 98 % of those with a plain N, B or K. A figure that is just seen is more often too large than too small.
+in 93 to 98 % of those with a plain N, B or K. A figure that is just seen is more often too large
+than too small.
 
 References
 ----------

@@ -365,11 +365,9 @@ def _refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, also: tupl
     fitted = fit_with_fleet(poses, units, fleet)
     try:
         found = refine(poses, units, base=_BASE, also=also)
+        refined = gated(found.calibration)
     except RefusedFitError as err:
         return _without_search(fitted, err.message, err.advice)
-    if found.refusal:
-        return _without_search(fitted, *found.refusal)
-    refined = found.calibration
     if refined.model.effects == MODELS[_BASE].effects:
         return _with(found, fitted)
     values, covariance, findings = posterior(refined.model.vector, refined.covariance, fleet)
