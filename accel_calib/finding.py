@@ -24,7 +24,7 @@ LEVELS: tuple[Level, ...] = get_args(Level)
 """Levels, the best first: a note, less accurate than it could be, not fit for use."""
 
 KINDS: Mapping[str, str] = MappingProxyType({
-    'refused': 'the refined calibration does not pass the gate',
+    'refused': 'the refined calibration must not be used',
     'wiring': 'known orientations show swapped axes, wrong signs or a rotation',
     'flat_pose': 'the flat pose is not near the expected axis',
     'error': 'the error is larger than a limit',

@@ -14,7 +14,7 @@ from pathlib import Path
 import shlex
 
 import accel_calib as ac
-from accel_calib.calibration import fit_poses, gated, Rejected
+from accel_calib.calibration import fit_poses, gated, refused as calibration_refused, Rejected
 from accel_calib.errors import RefusedFitError
 from accel_calib.finding import Finding, KINDS, NextStep, rated, without
 from accel_calib.findings import Expected, GOOD_MG, rate, rate_comparison, rate_verification
@@ -65,6 +65,25 @@ def test_the_error_of_a_good_calibration_is_below_the_stated_one(poses, noise, s
     assert rating.name == 'GOOD', rating
     stated = Expected(calibration).error_mg
     assert error_mg(calibration, model_with(COMMON)) < min(1.2 * stated, GOOD_MG)
+
+
+def test_the_stated_error_is_a_bound_where_the_noise_is_not_known():
+    below = []
+    for seed in range(60):
+        up = random_directions(13, np.random.default_rng(seed))
+        poses = simulated(directions=up, noise=0.02, seed=100 + seed)
+        calibration = ac.fit(poses.without_columns('std', 'count'), model='10')
+        if not calibration.rejected:
+            error = error_mg(calibration, model_with(COMMON))
+            below.append(error < Expected(calibration).error_mg)
+    assert np.mean(below) > 0.95
+
+
+def test_a_calibration_that_holds_at_a_temperature_is_not_said_to_end_before_it():
+    calibration = ac.fit(simulated(temperature=[26.0, 27.0]), flat=1)
+    poses = simulated(temperature=[30.0, 30.4], seed=3)
+    rating = rate_verification(ac.verify(poses, calibration), calibration, poses)
+    assert rating.next.text.endswith('fit again when the temperature leaves 26..31 °C')
 
 
 UP = spread_directions(60)
@@ -135,11 +154,15 @@ def test_a_fit_beside_a_refused_refinement_is_not_bad():
     table = simulated({'offset': [0.02, 0.0, 0.0], 'quadratic': [0.005, 0.004, -0.005]}, poses=60)
     result = ac.refine(table)
     assert result.steps
-    refused = replace(result, refusal=('the poses do not determine it', 'take more poses'))
+    refused = replace(result, calibration=calibration_refused(
+        result.calibration, 'the poses do not determine it', 'take more poses'))
     rating = rate(ac.fit(table), refinement=refused)
     assert rating.name == 'USABLE'
     assert rating.next == NextStep('poses', 'take more poses')
     assert rate(refused.calibration, refinement=refused).name == 'BAD'
+    assert refused.calibration.rating.name == 'BAD'
+    with pytest.raises(RefusedFitError, match='do not determine it'):
+        refused.calibration.save('refused.yaml')
 
 
 NEAR = FACES[[0]] + 0.1 * random_directions(12, np.random.default_rng(3))

@@ -182,6 +182,18 @@ def test_single_missing_samples_and_jitter_of_the_stamps_do_not_change_the_figur
             assert low < 1e-4 * STANDARD_GRAVITY < high
 
 
+def test_a_change_of_the_rate_ends_a_rest_and_a_vibration_widens_the_intervals() -> None:
+    rng, wave = np.random.default_rng(11), np.sin(1.087 * np.arange(30_000))[:, np.newaxis]
+    slow = resting(11, 20_000, 1e-4 / np.sqrt(2.0))  # the same density at half the rate
+    time = np.append(np.arange(10_000), 1e4 + 2.0 * np.arange(20_000)) / RATE
+    for recording in (
+            samples_of(time, np.append(resting(12, 10_000).reading, slow.reading, axis=0), 'g'),
+            sampled(1e-3 * rng.normal(size=(30_000, 3)) + 2e-3 * wave + UP)):
+        for axis in range(3):
+            low, high = figure_of(noise_of(recording, G), 'noise_density', axis).interval
+            assert low < 1e-4 * STANDARD_GRAVITY < high
+
+
 def test_a_low_pass_filter_is_noted_and_the_density_is_that_of_long_times() -> None:
     rng = np.random.default_rng(12)
     raw = 1e-4 * np.sqrt(RATE) * rng.normal(size=(60_007, 3))

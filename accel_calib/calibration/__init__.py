@@ -29,7 +29,7 @@ from .planning import (
     refuse_if_unfit, SessionPlan)
 from .quality import (
     deviations_g, errors_after, errors_before, fit_findings, gated, has_usual_gains, in_g,
-    LARGEST_OFFSET_G, OF_A_FIT, Outside, outside, quality_of, record_of, stated_uncertainty,
-    uncertainty_g, Verification, verify, with_rest_noise)
+    LARGEST_OFFSET_G, OF_A_FIT, Outside, outside, quality_of, record_of, refused,
+    stated_uncertainty, uncertainty_g, Verification, verify, with_rest_noise)
 from .rest_noise import gyro_bias_of, gyro_bias_of_rest, GyroBias, sample_noise_of, SampleNoise
 from .thermal import Curve, curve_of, thermal_alone, with_curve, without_curve

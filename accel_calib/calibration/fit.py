@@ -341,7 +341,15 @@ def rejected_by(model: Model, poses_g: Poses, out: Indices | None = None
 
 def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
     """Fit poses of known orientation; parameters and errors as in `fit_poses`."""
-    poses, reason = _with_reference(poses, units)
+    reason = 'the orientations are known'
+    if 'reference' not in poses:
+        up, reason = faces(poses.reading), 'the poses are the six faces'
+        if up is None:
+            raise RefusedFitError(
+                'the poses have no ref_x,ref_y,ref_z and are not the six faces, but model 12 '
+                'needs known orientations', 'add these columns, use only the six faces (--rows), '
+                'or use model 10')
+        poses = poses.with_columns(reference=up * units.force_per_g)
     if method == 'ml':
         by_norm = _unless_placed_well(poses, units)
         if by_norm is not None:
@@ -378,18 +386,6 @@ def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
         fit, poses, units, unit(fit.poses_g['reference']), name=ORIENTED, method=method,
         covariance=covariance_with(fit, unlike), rejected=rejected, reason=reason,
         noted=tuple(noted))
-
-
-def _with_reference(poses: Poses, units: Units) -> tuple[Poses, str]:
-    """Return poses with their known forces, and why these are known."""
-    if 'reference' in poses:
-        return poses, 'the orientations are known'
-    up = faces(poses.reading)
-    if up is None:
-        raise RefusedFitError('the poses have no ref_x,ref_y,ref_z and are not the six faces, but '
-                              'model 12 needs known orientations', 'add these columns, use only '
-                              'the six faces (--rows), or use model 10')
-    return poses.with_columns(reference=up * units.force_per_g), 'the poses are the six faces'
 
 
 def _unless_placed_well(poses: Poses, units: Units) -> Calibration | None:

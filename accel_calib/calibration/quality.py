@@ -312,14 +312,23 @@ def finished(calibration: Calibration, sensor: str, date: str) -> Calibration:
     return with_rest_noise(gated(named), named.poses)
 
 
+def refused(calibration: Calibration, message: str, advice: str) -> Calibration:
+    """Return a calibration that the gate refuses, with this finding, and that is rated BAD."""
+    found = Finding('refused', message, advice, 'BAD')
+    return replace(calibration, noted=(found, *calibration.noted))
+
+
 @np.errstate(over='ignore', invalid='ignore')
 def gated(calibration: Calibration) -> Calibration:
     """
     Check a calibration, and return it with a finding if its uncertainty is large.
 
-    Raise RefusedFitError if it is not plausible.
+    Raise RefusedFitError if it is not plausible, or was refused before.
 
     """
+    for each in calibration.noted:
+        if each.kind == 'refused':
+            raise RefusedFitError(each.text, each.advice)
     _check_numbers(calibration)
     _check_plausible(calibration)
     if calibration.method == PRIOR:

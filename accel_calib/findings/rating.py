@@ -73,11 +73,7 @@ def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> R
 
 
 def _find_failures(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
-    """Yield a finding if the calibration is refused, or the readings are as good without it."""
-    if (refinement is not None and refinement.refusal
-            and expected.effects == refinement.calibration.model.effects):
-        message, advice = refinement.refusal
-        yield Finding('refused', message, advice, 'BAD')
+    """Yield a finding if the readings are about as good without the calibration, or bad."""
     own, before, is_partial = expected.own_mg, expected.before_mg, expected.is_partial
     if expected.noise_mg is None and expected.dof < TO_CHECK.value:
         return  # the uncertainty is hardly known
@@ -255,14 +251,21 @@ def _advise(expected: Expected, otherwise: str) -> str:
                 otherwise)
 
 
-def step_after(calibration: Calibration, refinement: Refinement | None = None) -> NextStep:
-    """Return what to do with a good calibration; the rows are not those of its stored base."""
+def step_after(calibration: Calibration, refinement: Refinement | None = None, *checked: Poses
+               ) -> NextStep:
+    """
+    Return what to do with a good calibration; the rows are not those of its stored base.
+
+    It also holds at the temperatures of the poses that it was `checked` by.
+
+    """
     poses, words = calibration.used_poses, 'place the robot level, and level the mounting by it'
     if refinement is not None and 'new' in refinement.poses_g:
         old = refinement.poses_g['new'] <= 0.0
         poses = poses.take(~np.isin(poses.row, refinement.poses_g.row[old]))
     if calibration.is_levelled:
-        low, high = range_of(poses, 'temperature')
+        limits = [range_of(each, 'temperature') for each in (poses, *checked)]
+        low, high = min(low for low, _ in limits), max(high for _, high in limits)
         room = max(SPAN.value - (high - low), 0.0) / 2.0
         warm = 'record the temperature, too' if math.isnan(low) else (
             f'fit again when the temperature leaves {math.floor(low - room)}..'
@@ -327,7 +330,8 @@ def rate_verification(verification: Verification, calibration: Calibration, pose
     figures = (f'{number(verification.rms_before_mg)} -> {mg(verification.rms_after_mg)}, '
                f'largest {mg(verification.max_after_percent * MG / 100.0)}, {noise}, '
                f'{counted(len(poses), "pose")}, {100.0 * covered:.0f} % of the sphere')
-    return rated(found, f'{what} ({degrees(error)} of tilt)', figures, step_after(calibration))
+    return rated(found, f'{what} ({degrees(error)} of tilt)', figures,
+                 step_after(calibration, None, poses))
 
 
 def rate_comparison(comparison: Comparison) -> Rating:

@@ -108,6 +108,9 @@ _LONG = 1.5
 _INTERRUPTED = 10
 """Number of missing samples in a row that interrupts a rest."""
 
+_RATES, _OTHER_RATE = 20, 1.25
+"""Largest number of parts of a rest whose rates are compared, and ratio of two that differ."""
+
 _MOST_MISSING = 0.02
 """Largest part of missing samples; with more long intervals, the stamps have jitter."""
 
@@ -240,7 +243,13 @@ def _uninterrupted(time: Floats, start: float, end: float) -> Iterator[tuple[int
     usual = float(np.median(step)) + float(np.mean(np.maximum(step, 0.0)))
     cuts = (np.diff(inside) > 1) | (step < 0.0) | (step > _INTERRUPTED * usual)
     for part in np.split(inside, np.flatnonzero(cuts) + 1):
-        yield int(part[0]), int(part[-1]) + 1
+        ends = np.linspace(0, len(part) - 1, 1 + max(min(_RATES, len(part) // LEAST_SAMPLES), 1))
+        ends = ends.astype(np.intp)
+        intervals = np.diff(time[part[ends]]) / np.diff(ends)
+        changes = np.abs(np.diff(np.log(np.maximum(intervals, 1e-300)))) > np.log(_OTHER_RATE)
+        around = np.convolve(changes, np.ones(3), 'same')[:len(changes)] > 0.0
+        for piece in np.split(part, ends[1:-1][around]):  # without the part of the change
+            yield int(piece[0]), int(piece[-1]) + 1
 
 
 def _regular(rest: Recording, units: Units) -> LongRest:

@@ -34,14 +34,14 @@ from .steps import (
 from ..calibration import (
     Calibration, check_sensor, CLIPPED, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior,
     gated, in_g, LARGEST_DILUTION, OF_A_FIT, only_norm, plan_refinement, PosePlan, posterior,
-    quality_of, record_of, refuse_if_unfit, Rejected, rejected_by, sound_rows, sure_rows,
+    quality_of, record_of, refuse_if_unfit, refused, Rejected, rejected_by, sound_rows, sure_rows,
     uncertainty_g, with_rest_noise)
 from ..effects import (
     add_history, covariance_of_steps, EffectKey, Model, MODELS, OwnEffect, PROCESSES, step_of,
     unchanged, with_vector)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import fit_sphere, judge, NotConvergedError, originals, outliers, variance_factor
-from ..finding import CAUSES, explained_by, Finding, without as without_kinds
+from ..finding import CAUSES, explained_by, Finding, has, without as without_kinds
 from ..geometry import unit
 from ..statistics import rms
 from ..table import check_units, Floats, Poses, Record
@@ -96,9 +96,7 @@ class Refinement(Record):
     remarks : tuple of Remark
         What there is to say for advice; `advice` in words.
     calibration : Calibration
-        The refined calibration.
-    refusal : tuple of str
-        Reason why the calibration must not be stored or used, and advice; empty if it is usable.
+        The refined calibration; with the finding ``refused`` if it must not be stored or used.
     poses_g : Poses
         The poses kept, in g.
     force : (n, 3) array
@@ -131,7 +129,6 @@ class Refinement(Record):
     force: Floats
     stages: tuple[Stage, ...]
     steps: tuple[Step, ...] = ()
-    refusal: tuple[str, ...] = ()
     plan: PosePlan = PosePlan()
     undecided: bool = False
     one_curve: tuple[str, ...] = ()
@@ -141,6 +138,12 @@ class Refinement(Record):
         names = ' + '.join([self.calibration.name, *(step.effect for step in self.steps)])
         return (f'Refinement({self.verdict}: {names}; residual {self.gap_mg:.3g} -> '
                 f'{self.remaining_gap_mg:.3g} mg)')
+
+    @property
+    def refusal(self) -> tuple[str, ...]:
+        """Return why the calibration must not be used, and advice; empty if it is usable."""
+        return next(((each.text, each.advice) for each in self.calibration.noted
+                     if each.kind == 'refused'), ())
 
     @cached_property
     def advice(self) -> tuple[str, ...]:
@@ -333,11 +336,12 @@ def _conclude(calibration: Calibration, found: Found, given: Given) -> Refinemen
                       for row in given.poses_g.row[found.clipped.poses]]
     given = replace(given, rejected=(
         *given.rejected, *(each for each in of_search if each.row in given.poses.row)))
-    refined, refusal = refined_calibration(calibration, final, found.added, given)
+    refined = refined_calibration(calibration, final, found.added, given)
+    is_refused = has(refined.noted, 'refused')
     outliers = tuple(each.row for each in refined.rejected if each.kind != 'clipped')
-    if refusal:
+    if is_refused:
         steps = tuple(replace(step, parameters_sd={}) for step in steps)
-    verdict, undecided = verdict_of(found, steps, refused=bool(refusal))
+    verdict, undecided = verdict_of(found, steps, refused=is_refused)
     cause = next((each.advice for each in (*given.poses.findings, *given.notes)
                   if each.kind in CAUSES), '')
     remarks = remarks_on(found, steps, missing, len(outliers), cause=cause,
@@ -346,7 +350,7 @@ def _conclude(calibration: Calibration, found: Found, given: Given) -> Refinemen
     return replace(
         fitted, verdict=verdict, undecided=undecided, steps=steps, stages=stages, plan=plan,
         gap_mg=start.gap_mg(start.fit.residual), remaining_gap_mg=final.gap_mg(final.residual),
-        disturbed_poses=outliers, refusal=refusal, one_curve=found.one_curve, also=found.also)
+        disturbed_poses=outliers, one_curve=found.one_curve, also=found.also)
 
 
 def _refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, also: tuple[OwnEffect, ...]
@@ -361,11 +365,9 @@ def _refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, also: tupl
     fitted = fit_with_fleet(poses, units, fleet)
     try:
         found = refine(poses, units, base=_BASE, also=also)
+        refined = gated(found.calibration)
     except RefusedFitError as err:
         return _without_search(fitted, err.message, err.advice)
-    if found.refusal:
-        return _without_search(fitted, *found.refusal)
-    refined = found.calibration
     if refined.model.effects == MODELS[_BASE].effects:
         return _with(found, fitted)
     values, covariance, findings = posterior(refined.model.vector, refined.covariance, fleet)
@@ -493,15 +495,13 @@ def refitted(before: Calibration, poses: Poses, *, sensor: str = '', date: str =
     out = [Rejected(int(row), 'outlier', 'outlier') for row in poses_g.row
            if row not in final.poses_g.row]
     given = Given(poses, poses_g, stored=True, rejected=(*doubts, *unsound, *out), notes=())
-    calibration, refusal = refined_calibration(before, _with_steps(final, poses), (), given)
-    if refusal:
-        raise RefusedFitError(*refusal)
+    calibration = gated(refined_calibration(before, _with_steps(final, poses), (), given))
     return replace(calibration, reason=before.reason, sensor=sensor or before.sensor, date=date)
 
 
 def refined_calibration(base: Calibration, final: State, added: tuple[EffectKey, ...], given: Given
-                        ) -> tuple[Calibration, tuple[str, ...]]:
-    """Return the refined calibration, and the refusal if it must not be used."""
+                        ) -> Calibration:
+    """Return the refined calibration, with the finding ``refused`` if it must not be used."""
     model, matrix = with_changes(final.model)
     kept, poses = final.poses_g, given.poses
     if 'new' in kept:  # beside the poses of the stored calibration
@@ -521,33 +521,34 @@ def refined_calibration(base: Calibration, final: State, added: tuple[EffectKey,
         rejected=tuple(sorted(given.rejected, key=lambda each: each.row)),
         noted=(*given.notes, *findings), method='ml',
         reason=f'{base.reason}; refined: {names or "nothing added"}')
-    if len(model.vector) > len(base.model.vector) and (
-            final.dof < _LEAST_CHECKS or refined.quality.held_out_rms_mg is None):
-        return refined, (
-            f'{counted(len(final.poses_g), "pose")} check {counted(len(model.vector), "value")} '
-            f'too little to add effects, expected at least {_LEAST_CHECKS} more than values',
-            'take 24 poses or more, or use the result of fit')
     try:
+        if len(model.vector) > len(base.model.vector) and (
+                final.dof < _LEAST_CHECKS or refined.quality.held_out_rms_mg is None):
+            raise RefusedFitError(
+                f'{counted(len(final.poses_g), "pose")} check '
+                f'{counted(len(model.vector), "value")} too little to add effects, expected at '
+                f'least {_LEAST_CHECKS} more than values',
+                'take 24 poses or more, or use the result of fit')
         return _determined(gated(with_rest_noise(refined, given.poses)), final)
-    except RefusedFitError as refused:
-        return refined, (refused.message, refused.advice)
+    except RefusedFitError as err:
+        return refused(refined, err.message, err.advice)
 
 
-def _determined(refined: Calibration, final: State) -> tuple[Calibration, tuple[str, ...]]:
-    """Return a calibration with findings, or a refusal if the poses do not determine it."""
+def _determined(refined: Calibration, final: State) -> Calibration:
+    """Return a calibration with findings; RefusedFitError if the poses do not determine it."""
     fit = final.fit
     if refined.name == 'ideal':  # an offset that was not fitted is not zero
         refuse_if_unfit('4', unit(fit.equations.force))
     if fit.undetermined:
-        return refined, (f'the poses do not determine {", ".join(fit.undetermined[:_NAMED])}'
-                         f'{", …" if len(fit.undetermined) > _NAMED else ""}',
-                         TAKE_ALL_SIDES)
+        raise RefusedFitError(
+            f'the poses do not determine {", ".join(fit.undetermined[:_NAMED])}'
+            f'{", …" if len(fit.undetermined) > _NAMED else ""}', TAKE_ALL_SIDES)
     factor = variance_factor(fit.chi2, fit.dof, fit.noise_known)
     dilution = uncertainty_g(refined) / float(np.median(fit.equations.scale) * np.sqrt(factor))
     if dilution > LARGEST_DILUTION:
-        return refined, ('the poses do not determine the refined calibration: the error of |a| '
-                         f'is up to {dilution:.3g} times that of a pose, expected less than '
-                         f'{LARGEST_DILUTION:.0f} times',
-                         TAKE_ALL_SIDES)
+        raise RefusedFitError(
+            'the poses do not determine the refined calibration: the error of |a| is up to '
+            f'{dilution:.3g} times that of a pose, expected less than {LARGEST_DILUTION:.0f} '
+            'times', TAKE_ALL_SIDES)
     own = without_kinds(fit_findings(fit, dilution), 'beyond_noise')  # the verdict states it
-    return replace(refined, noted=(*refined.noted, *own)), ()
+    return replace(refined, noted=(*refined.noted, *own))

@@ -111,8 +111,7 @@ def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
                for each in residual_figures(checked or calibration.quality)
                if each.key != 'max_before_mg']
     refusal = '' if refinement is None or not refinement.refusal else (
-        'the refined calibration must not be used: '
-        f'{refinement.refusal[0]}; {refinement.refusal[1]}')
+        f'the refined calibration must not be used: {"; ".join(refinement.refusal)}')
     head, rows = _pose_table(residuals, calibration)
     sensor = calibration.sensor and f'sensor {calibration.sensor}'
     return page(

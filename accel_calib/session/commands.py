@@ -172,11 +172,8 @@ def _compute(session: Holder, function: Callable[..., Fitted], **given: Any) -> 
         raise ChangedError(f'another command changed the calibration during ~/{name}; '
                            'the result is discarded', f'call ~/{name} again')
     rating, refinement = found.rating, found.refinement
-    refusal = (rating.reason, rating.next.text) if rating.name == 'BAD' else ()
-    if refinement is not None and refinement.refusal:
-        refusal = refinement.refusal
-    if refusal:
-        why, advice = refusal
+    if rating.name == 'BAD':
+        why, advice = rating.reason, rating.next.text
         is_asked = refinement is None and rating.next.kind == 'poses'  # the step names the pose
         session.refuse('poses', why if is_asked else advice)
         advice = (_asked(session) if is_asked else '') or advice

@@ -27,7 +27,7 @@ from .stream import AGAIN, Around, StreamStatistics
 from .worker import (
     Compute, Event, Files, Log, Mounting, nothing, Parse, Result, Severity, ShowPoses, Task,
     Throttle)
-from ..calibration import Calibration, in_frame, on_topics, plan_session
+from ..calibration import Calibration, in_frame, on_topics, plan_session, refused
 from ..effects import effects_of_file, OwnEffect, shown_name
 from ..errors import DamagedCalibrationError, InputError, StoredCalibrationError
 from ..findings import (
@@ -114,7 +114,8 @@ def refine(poses: Poses, units: Units, sensor: str, before: Calibration | None, 
                               sensor=sensor, date=now(), also=own)
     beyond = [step for step in refinement.steps if step.times_typical > _BEYOND]
     if beyond and not refinement.refusal:
-        refinement = replace(refinement, refusal=(
+        refinement = replace(refinement, calibration=refused(
+            refinement.calibration,
             f'{beyond[0].effect} is {beyond[0].times_typical:.0f} times that of typical parts',
             f'find what else changed with it; {hint}' if hint else 'find what else changed with '
             'it: check the mounting and the setup, and take the poses again'))
