@@ -115,23 +115,6 @@ def test_sensor_that_tumbles_from_the_first_second_is_not_still_until_it_rests(
     np.testing.assert_allclose(now.up, (0.6, 0.0, 0.8), atol=0.1)
 
 
-def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
-        home: Path, readings: Readings) -> None:
-    driver = Driver()
-    turned = readings(spread_directions(12))
-    driver.feed(turned)
-    assert driver.ask('fit')
-    driver.now += 3.0
-    assert driver.feed(turned[:50], 'another') == 50
-    assert driver.session.state.name == 'another'
-    assert driver.calibration is None
-    assert len(driver.poses) < 2
-    driver.now += 3.0
-    driver.feed(turned[:50])
-    assert driver.calibration is not None
-    assert {path.stem for path in home.glob('*.yaml')} == {'imu.data_raw@imu_link'}
-
-
 def test_levelling_between_two_messages_imports_no_large_library(stored: Stored) -> None:
     code = ('import sys; from driven import Driver, GRAVITY; import numpy as np; '
             'driver = Driver(calibration_file=sys.argv[1]); '
