@@ -3,7 +3,7 @@
 
 """The calibrator without ROS: files of each sensor, accepted messages and refusals."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 import shutil
 from typing import Any
@@ -197,6 +197,31 @@ def test_automatic_fits_are_a_minute_apart(readings: Readings) -> None:
     while driver.sensor.fitted_poses == 12:
         driver.tick(1.0)
     assert 57.0 < driver.now - first < 61.0
+
+
+# Parameters
+
+
+@pytest.mark.parametrize(('name', 'value'), table('parameters_out_of_range'))
+def test_values_that_parameters_do_not_accept_are_refused(name: str, value: Any) -> None:
+    with pytest.raises(InputError, match=f'parameter {name} is .*, expected '):
+        changed(CalibratorSettings(), {name: value})
+
+
+def accepts(name: str, value: Any) -> bool:
+    """Return whether a parameter has a value, also if it contradicts that of another one."""
+    try:
+        return bool(getattr(changed(CalibratorSettings(), {name: value}), name) == value)
+    except InputError as error:
+        return f'parameter {name} is ' not in str(error)
+
+
+def test_parameters_accept_their_limits_and_nothing_beyond_them() -> None:
+    for each in fields(CalibratorSettings):
+        step = 1 if type(each.metadata['default']) is int else 1e-6
+        for limit, beyond in zip(each.metadata['limits'] or (), (-step, step)):
+            assert accepts(each.name, limit), each.name
+            assert not accepts(each.name, limit + beyond * max(abs(limit), 1)), each.name
 
 
 # The stream
