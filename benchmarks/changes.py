@@ -219,13 +219,7 @@ def alarm_line(what: str, sensor: Sensor, attitudes: Attitudes, sets: int, rests
 
 def watching(frame: Frame, sets: int = 200, long: int = 20, rests: int = 10_000, seed: int = 1
              ) -> Iterator[str]:
-    """
-    Yield the page of monitoring.
-
-    `sets` sensors are drawn for each kind of change; `long` sensors are monitored for alarms, over
-    `rests` each.
-
-    """
+    """Yield the page: `sets` sensors for each change, and `long` over `rests` each for alarms."""
     lines = []
     rng, one, anywhere = np.random.default_rng(seed), rest_in_one, random_directions
     sensors = [Sensor(poses, noise) for noise in (0.0001, 0.0003, 0.0005, 0.001)

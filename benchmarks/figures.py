@@ -14,7 +14,7 @@ on the package of this repository and with the helpers of its tests::
 import argparse
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, redirect_stdout
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
@@ -71,12 +71,7 @@ def check(what: str, measured: str, value: float, *, least: float = -math.inf,
 
 def share(what: str, good: Iterable[object], *, least: float = -math.inf,
           most: float = math.inf) -> Line:
-    """
-    Return the line of the share of sets that are good, with limits [%].
-
-    It has their number, and the exact interval for 95 % (Clopper and Pearson).
-
-    """
+    """Return the line of the share of sets that are good [%], with its exact 95 % interval."""
     from scipy.stats import binomtest  # here: processes that measure memory do without
 
     each = [bool(one) for one in good]
@@ -151,6 +146,16 @@ def _measure(work: Callable[..., Any], given: Sequence[Any], prepare: Callable[.
                     largest_mb())
 
 
+def run_command(*command: str) -> None:
+    """Run a command of the command line; what it prints goes to standard error."""
+    from accel_calib.cli.main import main as accel_calib  # here: others measure without it
+
+    with redirect_stdout(sys.stderr):
+        status = accel_calib(list(command))
+    if status not in (0, 1):
+        raise RuntimeError(f'{" ".join(command)}: exit status {status}')
+
+
 def largest_mb() -> float:
     """Return the largest resident memory of this process so far [MB]; not that of its parent."""
     text = Path('/proc/self/status').read_text(encoding='ascii')
@@ -211,10 +216,9 @@ def main() -> None:
 
 def update(page: str, parts: Sequence[str]) -> str:
     """
-    Return a page with what was found.
+    Return a page with tables in the place of its own, in their order, and numbers in phrases.
 
-    Tables take the place of those in the page, in their order. A phrase is found in the page by
-    its words, and its numbers take the place of those there. What has no place comes last.
+    A phrase is found in the page by its words. What has no place comes last.
 
     """
     number = r'[-+]?\d[\d,.]*\d|\d'

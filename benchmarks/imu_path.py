@@ -40,12 +40,7 @@ Phases = dict[str, tuple[int, int, int]]
 
 @contextmanager
 def store_calibrations() -> Iterator[tuple[Path, Path]]:
-    """
-    Yield the files of a levelled 10-parameter calibration, with its poses, and of a refined one.
-
-    The poses have further effects, those of the refined calibration.
-
-    """
+    """Yield the files of a levelled calibration, with its poses, and of one with their effects."""
     warm = 25.0 + 10.0 * np.random.default_rng(SEED).uniform(-1.0, 1.0, 36)
     poses = ac.simulate({**KNOWN, **MORE}, poses=36, noise=0.0005, temperature=warm, seed=SEED)
     fitted = fit_poses(poses, UNITS, model='10')

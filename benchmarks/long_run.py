@@ -22,6 +22,7 @@ from figures import check, Frame, Line, markdown, table, tell
 from nodes import CALIBRATED, Caller, client, cpu_seconds, node_command, run_trial, Trial
 import numpy as np
 from numpy.typing import NDArray
+from shared import children
 
 CALLS = ('fit', 'refine', 'undo', 'save', 'load', 'capture_pose', 'set_level')
 """Services that are called in turn; the last two wait for the next rest of the sensor."""
@@ -83,17 +84,11 @@ class LongRun:
         return rounds * self.per_round
 
     def trend(self, column: Floats) -> tuple[float, float]:
-        """
-        Return the slope per hour of a figure after the warm-up, and its standard error.
-
-        The figure also has a pattern of the period of a round. Both are NaN if the values are too
-        few for a standard error.
-
-        """
+        """Return the slope per hour after the warm-up, and its standard error; NaN if few."""
         at = self.samples['at']
         hours = (at[-len(column):] - at[0])[self.warm:] * 1e-9 / HOUR
         values = column[self.warm:]
-        place = np.arange(len(values)) % self.per_round
+        place = np.arange(len(values)) % self.per_round  # a round has a pattern
         design = np.column_stack([hours, place[:, np.newaxis] == np.arange(self.per_round)])
         free = len(values) - design.shape[1]
         if free < 1:
@@ -114,8 +109,7 @@ def memory_mb(pid: int) -> tuple[float, float]:
 def take_sample(node: int, relay: int) -> dict[str, float]:
     """Return a sample of the node and the bare relay, and its time [ns]."""
     resident, own = memory_mb(node)
-    tasks = Path(f'/proc/{node}/task').glob('*/children')
-    worker = [memory_mb(int(child))[0] for task in tasks for child in task.read_text().split()]
+    worker = [memory_mb(child)[0] for child in children(node)]
     found = {'at': time.monotonic_ns(), 'node': resident, 'own': own,
              'worker': sum(worker) if worker else np.nan, 'relay': memory_mb(relay)[0],
              'cpu': cpu_seconds(node), 'bare': cpu_seconds(relay)}
@@ -124,19 +118,7 @@ def take_sample(node: int, relay: int) -> dict[str, float]:
 
 
 def run_rounds(rounds: int, seconds: float, interval: float, rate: float) -> LongRun:
-    """
-    Run the node for some rounds.
-
-    Parameters
-    ----------
-    rounds : int
-        Number of rounds.
-    seconds, interval : float
-        Time of a round, and between samples, of which a round has a whole number [s].
-    rate : float
-        Messages per second.
-
-    """
+    """Run rounds of so many seconds; an interval between samples divides them, a rate is in Hz."""
     per_round = round(seconds / interval)
     samples: list[dict[str, float]] = []
     answers: list[Answer] = []

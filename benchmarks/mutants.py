@@ -136,18 +136,14 @@ class Tests:
                          for name in self.data.measured_files()}
 
     def of(self, file: str, lines: Iterable[int]) -> list[str]:
-        """
-        Return the tests of these lines, or of the file if it is executed by its import.
-
-        What a fixture executes is of all tests of its file.
-
-        """
+        """Return the tests of these lines, or of the file if it is executed by its import."""
         by_line = self.data.contexts_by_lineno(self.measured[file])
         if any('' in by_line.get(line, ()) for line in lines):
             lines = by_line
         contexts = {each for line in lines for each in by_line.get(line, ()) if each}
         found = set()
         for test, _, phase in (context.rpartition('|') for context in contexts):
+            # What a fixture executes is of all tests of its file.
             found |= {test} if phase == 'run' else set(self.of_file[test.split('::')[0]])
         return sorted(found, key=lambda name: self.seconds[name])
 

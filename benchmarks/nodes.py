@@ -299,25 +299,11 @@ class Trial:
 def run_trial(programs: Mapping[str, list[str]], rate: float,
               during: Callable[..., object], *, listened: bool = True, lead: float = 0.0) -> Trial:
     """
-    Run relays, or the node, between a driver and a user.
+    Run the commands of relays, or of the node, by their topics, between a driver and a user.
 
-    Parameters
-    ----------
-    programs : mapping of str to list of str
-        Commands of the programs to measure, by their topics.
-    rate : float
-        Messages per second; 0: without a pause.
-    during : callable
-        Is called with the id of each program during the measurement, which ends when it returns.
-    listened : bool
-        Whether there is a user.
-    lead : float
-        Time from the first message of the driver to the start of the programs [s].
-
-    Raises
-    ------
-    RuntimeError
-        If messages do not arrive.
+    The driver sends at a rate [1/s]; 0: without a pause. `during` is called with the id of each
+    program, and the measurement ends when it returns. `listened` is whether there is a user, and
+    `lead` the time from the first message to the start of the programs [s].
 
     """
     with tempfile.TemporaryDirectory() as given, ExitStack() as stack:

@@ -18,14 +18,14 @@ from accel_calib.calibration import directions_of, fit_poses, next_pose as next_
 from accel_calib.effects import Model, model_with, predict, sensor_force, simulate_poses
 from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import closed_form, estimate, pose_noise, start_of
-from accel_calib.geometry import ATTITUDES, spread_directions, unit
+from accel_calib.geometry import ATTITUDES, spread_directions
 from accel_calib.refinement import refine, Refinement, Step
 from accel_calib.table import concatenated, Floats, Poses
 from figures import check, Frame, Line, markdown, share, table
 from generator import Around, measure, Setup, simulate, Simulated
 import numpy as np
 from sensors import length_error_mg, simulated_poses, tilt
-from shared import FACES, G, MPS2, poses_of, random_directions
+from shared import directions_named, FACES, G, MPS2, poses_of, random_directions
 
 COUNT = 12
 FAR = 10.0
@@ -60,17 +60,8 @@ def repeat_five(degrees: float, rng: np.random.Generator) -> Floats:
     return tilt(random_directions(5, rng)[np.arange(COUNT) % 5], degrees, rng)
 
 
-def draw_plane(degrees: float, rng: np.random.Generator) -> Floats:
-    """Draw poses about a random plane, held some degrees off."""
-    angle = rng.uniform(0.0, 2.0 * np.pi, COUNT)
-    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    ring = np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle]) @ axes.T
-    return tilt(ring, degrees, rng)
-
-
-def draw_cone(degrees: float, rng: np.random.Generator) -> Floats:
-    """Draw poses evenly in a cone about a random axis."""
-    z = rng.uniform(np.cos(np.radians(degrees)), 1.0, COUNT)
+def draw_around(z: Floats, rng: np.random.Generator) -> Floats:
+    """Draw directions with these components along a random axis."""
     angle, radius = rng.uniform(0.0, 2.0 * np.pi, COUNT), np.sqrt(1.0 - z ** 2)
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z]) @ axes.T
@@ -79,10 +70,12 @@ def draw_cone(degrees: float, rng: np.random.Generator) -> Floats:
 CASES: dict[str, tuple[Callable[..., Floats], float, float | None]] = {
     **{f'5 directions, held {off:g}° off': (repeat_five, off, 100.0 if off < 1 else None)
        for off in (0.0, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0)},
-    **{f'in a {angle:g}° cone': (draw_cone, angle, 100.0 if angle <= 45 else None)
-       for angle in (30.0, 45.0, 60.0, 75.0)},
-    **{f'in a plane, held {off:g}° off': (draw_plane, off, 100.0 if off < 2 else None)
-       for off in (0.0, 1.0, 2.0, 5.0, 10.0)},
+    **{f'in a {angle:g}° cone': (
+        lambda angle, rng: draw_around(rng.uniform(np.cos(np.radians(angle)), 1.0, COUNT), rng),
+        angle, 100.0 if angle <= 45 else None) for angle in (30.0, 45.0, 60.0, 75.0)},
+    **{f'in a plane, held {off:g}° off': (
+        lambda off, rng: tilt(draw_around(np.zeros(COUNT), rng), off, rng), off,
+        100.0 if off < 2 else None) for off in (0.0, 1.0, 2.0, 5.0, 10.0)},
     **{f'six faces twice, held {off:g}° off': (
         lambda off, rng: tilt(np.vstack([FACES, FACES]), off, rng), off,
         100.0 if off < 0.5 else None) for off in (0.0, 0.5, 1.0, 2.0, 5.0)},
@@ -110,15 +103,6 @@ def fit(poses: Poses, reading: Floats, model: str) -> float:
         return np.nan
 
 
-def named_directions(advice: str) -> Floats:
-    """Return the directions that words such as (+x -z) name, (n, 3)."""
-    found = []
-    for part in re.findall(r'\([-+xyz ]+\)', advice):
-        signs = {axis: float(f'{sign}1') for sign, axis in re.findall('([+-])([xyz])', part)}
-        found.append([signs.get(axis, 0.0) for axis in 'xyz'])
-    return unit(np.array(found).reshape(-1, 3))
-
-
 def draw_model(rng: np.random.Generator) -> Model:
     """Draw a sensor with offset, gains and cross-axis gains."""
     sizes = {'offset': 0.03, 'axis_gain': 0.02, 'cross_axis': 0.01}
@@ -143,7 +127,7 @@ def fit_set(name: str, seed: int, number: int) -> Outcome:
         found = length_error_mg(fit_poses(poses, G, model='10').correct(reading))
         return Outcome(False, found, forced)
     except RefusedFitError as refusal:
-        more = named_directions(refusal.advice)
+        more = directions_named(refusal.advice)
         offer = re.search(r'or use model (\d+)', refusal.advice)
         offered = offer.group(1) if offer else ''
         again = add_poses(poses, model, tilt(more, 5.0, rng), rng)
@@ -218,15 +202,10 @@ ORDERS: dict[str, tuple[Order, bool]] = {
 
 def take(name: str, seed: int, number: int) -> tuple[list[float], float]:
     """
-    Take the poses of a set.
+    Take the poses of a set, and return its errors and when the node asks for no more poses.
 
-    Returns
-    -------
-    list of float
-        RMS error of |a| on fresh directions from `FEWEST` poses on [mg]; NaN if the fit is
-        refused.
-    float
-        Number of poses at which the node asks for no more; infinite if it always asks.
+    The RMS errors of |a| on fresh directions are those from `FEWEST` poses on [mg]; NaN if the fit
+    is refused. A node that always asks stops at infinitely many poses.
 
     """
     (order, by_hand), rng = ORDERS[name], np.random.default_rng([seed, number])
@@ -297,12 +276,7 @@ class Named:
 
 def extend_set(made: Simulated, up: Floats, temperature: float, wait: float,
                rng: np.random.Generator) -> Simulated:
-    """
-    Return the poses of a sensor and one more in the pose table.
-
-    `up` is the direction that points up, and `wait` the time since the last pose [s].
-
-    """
+    """Return a pose table with one more pose, so many seconds after the last one."""
     setup = replace(made.setup, poses=1)
     sigma = setup.noise_mg * 1e-3 * setup.shaking ** rng.uniform(size=(1, 3))
     shaking = rng.normal(size=(1, 3, setup.samples)) * sigma[:, :, np.newaxis]

@@ -346,13 +346,7 @@ def lines_of(row: str, outcomes: Outcomes) -> Iterator[Line]:
 
 def lines_of_fresh(what: str, outcomes: Outcomes, most: float = np.inf, *,
                    harmless: bool = True) -> Iterator[Line]:
-    """
-    Yield the lines of the errors of fresh poses.
-
-    `most` is the largest ratio to the noise that is asked; `harmless` is whether no set may be
-    worse than the base.
-
-    """
+    """Yield the lines of the errors of fresh poses; if `harmless`, no set may be worse."""
     each = np.array([o.fresh for o in outcomes if o.fresh])
     if not len(each):
         return

@@ -62,16 +62,11 @@ class Log(NamedTuple):
 
 @dataclass(frozen=True)
 class Fault:
-    """
-    A fault, and the words of which one is said of it.
-
-    `right` is whether the recording is to be calibrated all the same.
-
-    """
+    """A fault of a recording."""
 
     make: Callable[[Log, np.random.Generator], Log]
-    words: tuple[str, ...]
-    right: bool = False
+    words: tuple[str, ...]  # one of them is said of it
+    right: bool = False  # whether the recording is to be calibrated all the same
 
 
 def insert(log: Log, place: float, rows: int, value: float) -> Log:

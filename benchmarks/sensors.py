@@ -76,25 +76,16 @@ class Sensor:
         return np.linalg.norm(np.linalg.solve(self.gain, (reading - self.offset).T), axis=0)
 
     def length_slopes(self, force: Floats) -> Floats:
-        """
-        Return the (n, 9) derivative of |force| by the values of model 10, at true forces of 1 g.
-
-        With a = û W⁻¹ the derivative by V_i is -a_i, and that by W_ij is -a_i u_j.
-
-        """
+        """Return the (n, 9) derivative of |force| by the values of model 10, at forces of 1 g."""
+        # With a = û W⁻¹ the derivative by V_i is -a_i, and that by W_ij is -a_i u_j.
         a = force @ np.linalg.inv(self.gain)
         cross = [a[:, i] * force[:, j] + a[:, j] * force[:, i]
                  for i, j in ((0, 1), (0, 2), (1, 2))]
         return -np.column_stack([a, a * force, *cross])
 
     def values(self, model: str) -> Floats:
-        """
-        Return the true values of a model, in the order of `Model.vector`.
-
-        Offset; gain of model 4, gains of the others; cross-axis xy, xz, yz; misalignment. W of
-        model 9 is that of the sensing axes: lower triangular, from a Cholesky decomposition.
-
-        """
+        """Return the true values of a model, in the order of `Model.vector`."""
+        # W of model 9 is that of the sensing axes: lower triangular.
         gain = np.linalg.cholesky(self.gain @ self.gain.T) if model == '9' else self.gain
         diagonal = np.diag(gain) - 1.0
         symmetric, skew = (gain + gain.T) / 2.0, (gain - gain.T) / 2.0

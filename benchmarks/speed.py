@@ -28,7 +28,7 @@ from accel_calib.stillness import capture
 from accel_calib.stored import read_calibration
 from accel_calib.table import Floats
 from bag_files import write_bag
-from figures import check, DATA, Frame, Line, measure_alone, Measured, ROOT, table, tell
+from figures import check, DATA, Frame, Line, measure_alone, Measured, run_command, table
 import numpy as np
 from rosbags.highlevel import AnyReader
 from scipy.optimize import least_squares
@@ -252,13 +252,7 @@ def lines_of_bag(folder: Path, storage: str, count: int, repeats: int, calibrati
 
 
 def recordings(frame: Frame, messages: int = FULL, repeats: int = 3) -> Iterator[str]:
-    """
-    Yield the page of recordings.
-
-    The bags have an Imu at 1 kHz that is turned through 36 poses, and other topics. They take 1.3
-    GB each in a folder below TMPDIR, where 4 GB must be free.
-
-    """
+    """Yield the page; the bags take 1.3 GB each below TMPDIR, where 4 GB must be free."""
     with TemporaryDirectory() as name:
         folder = Path(name)
         table_, calibration = folder / 'poses.csv', folder / 'calibration.yaml'
@@ -286,14 +280,6 @@ COMMANDS = {'capture': ('{log}', '-o', '{folder}/poses.csv'),
             'apply': ('{log}', '-c', '{folder}/c.yaml', '-o', '{folder}/corrected.csv'),
             'calibrate': ('{log}', '-o', '{folder}/new.yaml', '--no-refine'),
             'noise': ('{log}',)}
-WITH_MEMORY = """\
-import sys
-from accel_calib.cli.main import main
-status = main()
-print(open('/proc/self/status').read(), file=sys.stderr)
-sys.exit(status)
-"""
-"""A command that prints the figures of its process; `getrusage` would include its parent."""
 
 
 def write_csv(path: Path, count: int, still: bool, seed: int) -> None:
@@ -310,15 +296,6 @@ def write_csv(path: Path, count: int, still: bool, seed: int) -> None:
         file.writelines(f'{k / CSV_HZ:.2f}{ends[k % len(ends)]}' for k in range(count))
 
 
-def largest_of(command: list[str]) -> float:
-    """Run a command of the command line, and return its largest resident memory [MB]."""
-    done = subprocess.run([sys.executable, '-c', WITH_MEMORY, *command], cwd=ROOT, text=True,
-                          stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=False)
-    if done.returncode not in (0, 1):
-        raise RuntimeError(f'{" ".join(command)}: exit status {done.returncode}')
-    return int(done.stderr.partition('VmHWM:')[2].split()[0]) * 1.024e-3
-
-
 def memory(frame: Frame, millions: tuple[float, ...] = (1.0, 3.0, 10.0), seed: int = 1
            ) -> Iterator[str]:
     """Yield the page of memory; `millions` of samples are ascending."""
@@ -331,9 +308,8 @@ def memory(frame: Frame, millions: tuple[float, ...] = (1.0, 3.0, 10.0), seed: i
             for name, words in COMMANDS.items():
                 if name in ('capture', 'noise'):
                     write_csv(log, size, name == 'noise', seed)
-                found[name].append((size, largest_of(
-                    [name, *(word.format(log=log, folder=folder) for word in words)])))
-                tell(name, *found[name][-1])
+                found[name].append((size, measure_alone(run_command, name, *(
+                    word.format(log=log, folder=folder) for word in words)).megabytes))
     lines = []
     for name, own in found.items():
         lines += [Line(f'{name}, {size:,} samples, MB', f'{most:.0f}') for size, most in own]

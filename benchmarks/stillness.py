@@ -24,15 +24,15 @@ from accel_calib.calibration import fit_poses
 from accel_calib.errors import AccelCalibError
 from accel_calib.geometry import unit
 from accel_calib.logs import read_recording
-from accel_calib.stillness import CaptureSettings, StillDetector
+from accel_calib.stillness import capture, CaptureSettings, StillDetector
 from accel_calib.table import Floats
 from accel_calib.units import UnitName, units_of
-from figures import check, DATA, Frame, Line, markdown, table
+from figures import check, DATA, Frame, Line, markdown, share, table
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
+from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation
-from shared import poses_of, rows_of
+from shared import G, poses_of, rows_of, samples_of
 
 KINDS = {'plain': 'turned by hand', 'tremor': 'also held in the hand, tremor of 1 to 10 mg',
          'turning': 'also turned at 0.5 to 5 °/s', 'footsteps': 'steps of 2 to 20 mg beside it',
@@ -337,6 +337,36 @@ def lines_of(found: Scores, noise: str, sets: int) -> Iterator[Line]:
                         least=0.85, most=1.15, sets=sets)
 
 
+# --------------------------------------------------------------- disturbed from the first second
+
+FIRST: dict[str, tuple[str, tuple[float, float], tuple[float, float], dict[str, float]]] = {
+    'shaking at 1 to 5 Hz, 20 to 200 mg': ('swing', (1.0, 5.0), (0.02, 0.2), {'most': 0.0}),
+    'tremor at 8 to 12 Hz, 5 to 50 mg': ('swing', (8.0, 12.0), (5e-3, 0.05), {}),
+    'vibration at 30 to 80 Hz, 20 mg': ('swing', (30.0, 80.0), (0.02, 0.02), {'least': 95.0}),
+    'white noise of 20 to 50 mg': ('white', (0.0, 0.0), (0.02, 0.05), {'least': 95.0}),
+    'noise of 5 to 20 mg, low-pass at 5 to 40 Hz': (
+        'filtered', (5.0, 40.0), (5e-3, 0.02), {'least': 95.0})}
+"""What a sensor reads from the first second on: the kind, frequencies [Hz], sizes [g], and the
+limits of the share of recordings with a pose [%]."""
+
+
+def is_captured(what: str, seed: int, number: int) -> bool:
+    """Return whether a sensor that never rested before has a pose."""
+    kind, band, sizes, _ = FIRST[what]
+    rng = np.random.default_rng([seed, list(FIRST).index(what), number])
+    rate_hz = float(rng.choice((100.0, 200.0, 1000.0)))
+    count = int(12.0 * rate_hz)
+    force = Rotation.random(random_state=rng).apply([0.0, 0.0, 1.0])
+    frequency, size = rng.uniform(*band), np.exp(rng.uniform(*np.log(sizes)))
+    own = rng.normal(size=(2 * count, 3))
+    if kind == 'filtered':
+        own = lfilter(*butter(2, frequency, fs=rate_hz), own, axis=0)
+    own = own[count:] * (2e-3 if kind == 'swing' else size) / own[count:].std()
+    if kind == 'swing':
+        own += draw_swing(rng, count, rate_hz, size, frequency, min(0.05 * frequency, 0.5))
+    return len(capture(samples_of(np.arange(count) / rate_hz, force + own), G).poses) > 0
+
+
 # -------------------------------------------------------------------------------- real recordings
 
 def rows_of_real() -> Iterator[tuple[object, ...]]:
@@ -371,6 +401,8 @@ def stillness(frame: Frame, sets: int = 60, seed: int = 1) -> Iterator[str]:
     usual, noisy = (measure(frame, sets, seed, each) for each in (False, True))
     yield table([*lines_of(usual, 'noise 0.3 to 5 mg', sets),
                  *lines_of(noisy, 'noise 50 mg', sets)])
+    yield table(share(f'{what}: captured', frame.run_sets(is_captured, sets, what, seed), **limits)
+                for what, (*_, limits) in FIRST.items())
     yield compare_rules(usual)
     yield compare_rules(noisy)
     yield markdown(('recording', 'rule', 'poses', 'taken by hand', 'samples used', 'residual, mg',

@@ -45,11 +45,8 @@ def knocks_of(count: int, knocked: int, noise: str, seed: int) -> tuple[float, f
     """
     Fit a set with knocked poses.
 
-    Returns
-    -------
-    float, float, bool
-        Error of |a| on fresh directions, and that of a fit to the other poses [mg]; whether each
-        knock that shows is rejected, and no clean pose.
+    Return the error of |a| on fresh directions, and that of a fit to the other poses [mg], and
+    whether each knock that shows is rejected, and no clean pose.
 
     """
     rng = np.random.default_rng([seed, count, knocked])
@@ -261,14 +258,8 @@ def draw_set(kind: Kind, rng: np.random.Generator) -> tuple[Poses, Floats, Calla
     """
     Draw a sensor and measure its poses.
 
-    Returns
-    -------
-    Poses
-        In the unit of the readings, with noise and knocks.
-    (n,) array
-        Temperature in each pose [°C].
-    callable
-        (n, 3) forces [g] and (n,) temperatures -> readings without noise.
+    Return its poses in the unit of the readings, with noise and knocks, the temperature in each
+    [°C], and a function of (n, 3) forces [g] and (n,) temperatures: the readings without noise.
 
     """
     sensor = draw_sensor(rng)
@@ -359,12 +350,8 @@ def rows_of(results: Sequence[Result]) -> Iterator[tuple[object, ...]]:
 
 
 def rating(frame: Frame, sets: int = 100, seed: int = 4051) -> Iterator[str]:
-    """
-    Yield the tables; `sets` of each kind, and a fourth of those that are refined.
-
-    The seed is that of the published figures; the limits were chosen with the seeds 77 to 79.
-
-    """
+    """Yield the tables; `sets` of each kind, and a fourth of those that are refined."""
+    # The seed is that of the published figures; the limits were chosen with the seeds 77 to 79.
     results = frame.run(rate_set, [
         (index, number, seed) for index, kind in enumerate(KINDS)
         for number in range(max(sets // (4 if kind.refined else 1), 1))])

@@ -71,10 +71,10 @@ class Setup:
         Course of the temperature.
     rates : {'any', 'small', 'sizeable'}
         Angular rates; any: one of the others. They are sizeable if a lever arm is hidden.
-    hysteresis : {'unit', 'sign', 'memory', 'previous'}
+    hysteresis : {'unit', 'sign', 'memory'}
         Quantity to which hysteresis is proportional, by axis: the unit vector from the present
-        force to the previous one, the sign of this difference, the unit vector and a part of that
-        of the turn before, or the previous force.
+        force to the previous one, the sign of this difference, or the unit vector and a part of
+        that of the turn before.
     knocked : int
         Number of poses with an error of 10 to 50 mg.
     dropped : tuple of str

@@ -185,8 +185,7 @@ def _hysteresis(around: Around, traits: Traits) -> Floats:
     before = np.vstack([u[:1], u[:-1]])
     way = unit(before - u)
     shapes = {'unit': way, 'sign': np.sign(before - u),
-              'memory': way + traits.memory * np.vstack([np.zeros(3), way[:-1]]),
-              'previous': np.where(np.arange(len(u))[:, np.newaxis] > 0, before, 0.0)}
+              'memory': way + traits.memory * np.vstack([np.zeros(3), way[:-1]])}
     return shapes[traits.hysteresis]
 
 

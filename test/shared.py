@@ -150,6 +150,13 @@ def random_directions(count: int, rng: np.random.Generator) -> Floats:
     return unit(rng.normal(size=(count, 3)))
 
 
+def directions_named(text: str) -> Floats:
+    """Return the directions that a text such as ``(+x -z)`` names, (n, 3)."""
+    signs = [[(f'+{axis}' in part) - float(f'-{axis}' in part) for axis in 'xyz']
+             for part in re.findall(r'\([+-][+xyz -]*\)', text)]
+    return unit(np.array(signs).reshape(-1, 3))
+
+
 def changed(poses: TableT, rows: Any = slice(None), times: Any = 1.0, plus: Any = 0.0) -> TableT:
     """Return poses or samples with the readings of these rows, 0-based, changed."""
     reading = poses.reading.copy()

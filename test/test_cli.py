@@ -287,19 +287,6 @@ def recording(tmp_path):
     return path
 
 
-def test_a_recording_becomes_a_calibration_a_page_and_a_verdict(recording, tmp_path, capsys):
-    out = tmp_path / 'c.yaml'
-    status, result = run_json(capsys, 'calibrate', recording, '-o', out, '--flat', 'first')
-    assert (status, result['rating']) == (0, 'GOOD')
-    assert result['rating_reason']
-    np.testing.assert_allclose(np.array(result['offset']) / 9.80665, SENSOR['offset'], atol=2e-3)
-    stored = read_calibration(out)
-    assert stored.is_levelled
-    np.testing.assert_allclose(stored.apply(stored.poses.reading[0]), (0, 0, 9.80665), atol=0.05)
-    np.testing.assert_allclose(stored.offset, result['offset'])
-    assert 'GOOD' in (tmp_path / 'c.html').read_text(encoding='utf-8')
-
-
 def bent(path, *, bend_mg):
     """Write poses of a sensor whose readings are far from an ellipsoid, without their noise."""
     up = random_directions(40, np.random.default_rng(5))

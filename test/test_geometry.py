@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What poses determine, what they do not determine, and the next pose."""
 
-import re
-
 from accel_calib.calibration import (
     dilution, error_left_in, fit_poses, flat_direction, identifiability)
 from accel_calib.errors import RefusedFitError
@@ -15,7 +13,7 @@ from inside import (
     simulate_poses, spread_directions, unit, with_heading)
 import numpy as np
 import pytest
-from shared import attitudes, FACES, G, random_directions, sensor
+from shared import attitudes, directions_named, FACES, G, random_directions, sensor
 
 TURN = 2.0 * np.pi * np.arange(12) / 12.0
 RING = np.column_stack([np.cos(TURN), np.sin(TURN), np.zeros(12)])
@@ -32,12 +30,6 @@ def cone(degrees, rng):
     z, angle = rng.uniform((np.cos(np.radians(degrees)), 0.0), (1.0, 2.0 * np.pi), (12, 2)).T
     return np.column_stack([np.sqrt(1.0 - z ** 2) * np.cos(angle),
                             np.sqrt(1.0 - z ** 2) * np.sin(angle), z])
-
-
-def named(text):
-    """Return the directions that a text such as ``(+x -z)`` names, (n, 3)."""
-    return unit(np.array([[(f'+{axis}' in part) - float(f'-{axis}' in part) for axis in 'xyz']
-                          for part in re.findall(r'\([+-][+xyz -]*\)', text)]))
 
 
 @pytest.mark.parametrize(('model', 'noisy'), [('10', 1.0), ('7', 3.0), ('12', 3.0)])
@@ -83,7 +75,7 @@ def test_a_refusal_says_what_is_wrong_and_asks_for_poses_that_make_the_fit_possi
         return
     with pytest.raises(RefusedFitError, match=message if model == '10' else 'pose') as refusal:
         refuse_if_unfit(model, directions)
-    asked = named(refusal.value.advice)
+    asked = directions_named(refusal.value.advice)
     assert len(asked) == len(missing_poses(model, directions))
     assert dilution(model, np.vstack([directions, asked])) <= 3.0
     one_less = np.vstack([directions, asked[:-1]])

@@ -131,6 +131,13 @@ def test_repeated_poses_are_merged_and_undone_one_by_one() -> None:
     assert len(live.poses()) == 2
 
 
+def test_a_rest_that_is_played_again_is_no_other_pose_unless_its_mean_differs() -> None:
+    live = book_of([(0.0, [0, 0, 1]), (10.0, [0, 1, 0])], 'keep')
+    for direction, count in (([0, 0, 1], 2), ([0, 0.001, 1], 3)):
+        live.put(dwell(0.0, direction), ended=True)
+        assert len(live.poses()) == count
+
+
 def test_poses_of_a_robot_that_parks_for_years_need_bounded_memory() -> None:
     directions = spread_directions(6)
     live = book_of((10.0 * k, directions[k % 6]) for k in range(600))

@@ -3,7 +3,7 @@
 
 """The calibrator without ROS: files of each sensor, accepted messages and refusals."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 import shutil
 from typing import Any
@@ -115,23 +115,6 @@ def test_sensor_that_tumbles_from_the_first_second_is_not_still_until_it_rests(
     np.testing.assert_allclose(now.up, (0.6, 0.0, 0.8), atol=0.1)
 
 
-def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
-        home: Path, readings: Readings) -> None:
-    driver = Driver()
-    turned = readings(spread_directions(12))
-    driver.feed(turned)
-    assert driver.ask('fit')
-    driver.now += 3.0
-    assert driver.feed(turned[:50], 'another') == 50
-    assert driver.session.state.name == 'another'
-    assert driver.calibration is None
-    assert len(driver.poses) < 2
-    driver.now += 3.0
-    driver.feed(turned[:50])
-    assert driver.calibration is not None
-    assert {path.stem for path in home.glob('*.yaml')} == {'imu.data_raw@imu_link'}
-
-
 def test_levelling_between_two_messages_imports_no_large_library(stored: Stored) -> None:
     code = ('import sys; from driven import Driver, GRAVITY; import numpy as np; '
             'driver = Driver(calibration_file=sys.argv[1]); '
@@ -214,6 +197,31 @@ def test_automatic_fits_are_a_minute_apart(readings: Readings) -> None:
     while driver.sensor.fitted_poses == 12:
         driver.tick(1.0)
     assert 57.0 < driver.now - first < 61.0
+
+
+# Parameters
+
+
+@pytest.mark.parametrize(('name', 'value'), table('parameters_out_of_range'))
+def test_values_that_parameters_do_not_accept_are_refused(name: str, value: Any) -> None:
+    with pytest.raises(InputError, match=f'parameter {name} is .*, expected '):
+        changed(CalibratorSettings(), {name: value})
+
+
+def accepts(name: str, value: Any) -> bool:
+    """Return whether a parameter has a value, also if it contradicts that of another one."""
+    try:
+        return bool(getattr(changed(CalibratorSettings(), {name: value}), name) == value)
+    except InputError as error:
+        return f'parameter {name} is ' not in str(error)
+
+
+def test_parameters_accept_their_limits_and_nothing_beyond_them() -> None:
+    for each in fields(CalibratorSettings):
+        step = 1 if type(each.metadata['default']) is int else 1e-6
+        for limit, beyond in zip(each.metadata['limits'] or (), (-step, step)):
+            assert accepts(each.name, limit), each.name
+            assert not accepts(each.name, limit + beyond * max(abs(limit), 1)), each.name
 
 
 # The stream

@@ -13,7 +13,7 @@ from typing import Any
 import accel_calib as ac
 from accel_calib.calibration import Calibration, fit_poses, level, SampleNoise
 from accel_calib.logs import joined, layout_of
-from accel_calib.messages import corrected, motion_of, output_frame, Rewriter
+from accel_calib.messages import motion_of, output_frame, Rewriter
 from accel_calib.session import diagnostics, progress, Surroundings
 from accel_calib.units import units_of
 from driven import Driver
@@ -153,28 +153,10 @@ def messages() -> Any:
             write.bias = (0.01, -0.02, 0.03) if k == 5 else (0.0, 0.0, 0.0)
             out, begin = write(raw, {'temperature': 20.0 + 2.0 * k}) or b'', write.layout.begin
             single += [out[:begin], np.frombuffer(out[begin:]).tolist()]
-        every, large = joined(raws, 37, 'imu'), [
-            raws[0][:-96] + struct.pack('<3d', 0.0, size, 0.0) + raws[0][-72:]
-            for size in (np.nan, 900.0, 990.0, -1100.0)]
-        known = {'time': every.stamps, 'temperature': 20.0 + 2.0 * np.arange(6.0),
-                 'rate': every.columns['rate']}
         found[frame_id] = {
-            'single': single, 'together': corrected(calibration, every.doubles(slice(0, 37)),
-                                                    known), 'layout': layout, 'frame': to,
-            'ids': every.frame_ids, 'samples': every.columns, 'renamed': [
-                each[:48] for each in every.rewrite(every.doubles(slice(0, 37)), 'other')][:2],
-            'motion': motion_of(raws[0], layout, np.array([0.1, 0.2, 9.8]))[-32:], 'large': [
-                isinstance(attempt(write, each, {'temperature': 20.0}), bytes) for each in large]}
+            'single': single, 'layout': layout, 'frame': to,
+            'motion': motion_of(raws[0], layout, np.array([0.1, 0.2, 9.8]))[-32:]}
     raw = next(_messages('imu', 1))
-    swapped = raw[:1] + b'\0' + raw[2:4] + b''.join(
-        raw[k:k + 4][::-1] for k in range(4, 16, 4)) + raw[16:20] + b''.join(
-        raw[k:k + 8][::-1] for k in range(20, len(raw), 8))
-    ros1 = raw[:12] + struct.pack('<I', 3) + b'imu' + raw[-296:]
-    for name, raws, ros2 in (('big endian', [raw, swapped], True), ('ROS 1', [ros1], False)):
-        made = joined(raws, 37, 'imu', ros2=ros2)
-        found[name] = [made.stamps, made.doubles(slice(25, 28)), made.frame_ids,
-                       [each[:40] for each in made.rewrite(
-                           made.doubles(slice(0, 37)), 'longer_name')]]
     found['layouts'] = [layout_with(each) for each in ('', 'imu', 'imu_link', 'übung')]
     found['damaged'] = [layout_of(each) is None for each in (
         raw, raw[:-1], raw + b'\0', b'\0\0' + raw[2:], raw[:12] + b'\0' + raw[13:], raw[:20])]
