@@ -309,13 +309,13 @@ def _check_stream(state: State) -> list[Finding]:
     length = math.nan if units.is_native else size / units.per_g
     is_wrong = length < _LIKELY_G[0] or length > _LIKELY_G[1]  # not if it is NaN
     if is_wrong:
-        likely = next((name for name, low, high in _UNITS if low < size < high), 'native')
+        likely = next((name for name, low, high in _UNITS if low < size < high), '')
         found['unit'] = f'|a| is {length:.3g} g, expected about 1 g at rest: ' + (
             'this is linear acceleration, gravity removed: let the driver publish what the '
             'accelerometer reads' if length < _WITHOUT_GRAVITY_G else
             'its rests were about 1 g before: correct the range or the unit of the driver'
-            if likely == 'native' and (state.sensor.present or state.sensor.guide.count) else
-            _restart(state, 'units', likely))
+            if not likely and (state.sensor.present or state.sensor.guide.count) else
+            _restart(state, 'units', likely or 'native'))
     if statistics.dropped_ago < _LASTS:
         found |= {kind: f'dropped {counted(statistics.dropped[kind], what)} {why}'
                   for kind, (what, why) in _DROPPED.items() if statistics.dropped[kind]
