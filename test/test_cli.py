@@ -16,6 +16,7 @@ from accel_calib.errors import RefusedFitError
 from accel_calib.logs import write_table
 from accel_calib.stillness import CaptureSettings
 from accel_calib.stored import read_calibration
+from faults.sample import sample
 from inside import (
     are_samples, calibrated_by, CALIBRATOR, COMMAND, COMMANDS, FitPlan, is_partial, main, parser,
     rotation_from_rpy, spread_directions)
@@ -131,9 +132,9 @@ runpy.run_module({module!r}, run_name='__main__')
 
 
 @pytest.mark.parametrize(('name', 'handler', 'status'), [
-    *((name, 'default_int_handler', 130) for name in (
+    *((name, 'default_int_handler', 130) for name in sample((
         'argparse', 'accel_calib.errors', 'numpy', 'numpy.linalg._umath_linalg', 'rich.console',
-        'scipy.special._ufuncs')),
+        'scipy.special._ufuncs'), 3)),
     ('rich.console', 'SIG_IGN', 0), ('the end', 'default_int_handler', 0)])
 def test_ctrl_c_while_modules_load_ends_without_words_and_changes_nothing_later_or_if_ignored(
         name, handler, status, poses):

@@ -18,7 +18,6 @@ MAST = rotation_from_rpy(0.1, -0.2, 1.3)
 IMU = rotation_from_rpy(math.pi, 0.4, -0.7)
 LIDAR = rotation_from_rpy(0.0, 0.0, 0.5)
 BASE = rotation_from_rpy(0.02, 0.03, 2.0)
-UNIT = (0.0, 0.0, 0.0, 1.0)
 
 
 def robot() -> StaticTransforms:
