@@ -453,18 +453,20 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
     model = model_with(effects, rotation, own_effects(also))
     up = _unit_directions(directions, poses)
     rng, warm = np.random.default_rng(seed), np.asarray(temperature, float)
+    is_ramp = warm.shape in ((0,), (2,))
+    columns = {key: np.asarray(values, float) for key, values in (
+        context if is_ramp else {**context, 'temperature': warm}).items()}
+    for key, values in columns.items():
+        if recording or values.shape[:1] != (len(up),):
+            expected = 'no value by pose in a recording' if recording else f'{len(up)} rows'
+            raise InputError(f'{key} has shape {values.shape}, expected {expected}',
+                             f'give {key} for each pose')
     if recording:
         found: Table = simulate_recording(model, up, rng, noise_g=noise, rate_hz=rate, dwell=dwell,
                                           turn=turn, temperatures=warm.tolist())
     else:
-        columns = {key: np.asarray(values, float) for key, values in context.items()}
-        for key, values in columns.items():
-            if values.shape[:1] != (len(up),):
-                raise InputError(f'{key} has shape {values.shape}, expected {len(up)} rows',
-                                 f'give {key} for each pose')
-        if len(warm):
-            columns['temperature'] = warm if len(warm) == len(up) else np.linspace(
-                warm[0], warm[-1], len(up))
+        if is_ramp and len(warm):
+            columns['temperature'] = np.linspace(*warm, len(up))
         found = simulate_poses(model, up, rng, noise_g=noise, samples=samples,
                                context={'reference': up, **columns})
     found = in_unit(found, known.from_g, native=known.is_native)

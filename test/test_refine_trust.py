@@ -10,7 +10,7 @@ import re
 import accel_calib as ac
 from accel_calib.calibration import fit_poses, verify
 from accel_calib.effects import add_history
-from accel_calib.findings import rate
+from accel_calib.findings import rate, short_verdict
 from accel_calib.logs import read_recording, write_table
 from accel_calib.refinement import refine
 from accel_calib.stored import write_calibration
@@ -365,8 +365,8 @@ def test_effects_of_twelve_poses_are_named_and_not_used(seed):
                            context={'temperature': rng.uniform(15.0, 35.0, 12)})
     found = refine(poses, G, base='7')
     assert (len(names(found)), found.verdict) == (1, 'unexplained')
-    assert (bool(found.refusal), found.undecided) == (True, True)
-    assert not found.steps[0].parameters_sd
+    assert (len(found.refusal), found.undecided, found.steps[0].parameters_sd) == (2, True, {})
+    assert short_verdict(found) == 'too few poses to tell what explains the gap'
 
 
 def test_samples_of_a_board_that_hardly_turns_give_it_no_absurd_gain():

@@ -4,10 +4,9 @@
 """Lag and rate of the temperature: known solutions, wavy temperatures, streams."""
 
 from accel_calib.effects import add_history, TemperatureHistory
-from accel_calib.errors import InputError
 from accel_calib.estimate import estimate
 from inside import (
-    acting_temperature, Lag, low_passed, Model, predict, rate_of, simulate_poses, ThermalStream)
+    acting_temperature, Lag, low_passed, Model, rate_of, simulate_poses, ThermalStream)
 import numpy as np
 import pytest
 from shared import random_directions, rms, SENSOR
@@ -64,6 +63,11 @@ def test_order_of_the_rows_and_rows_without_values_do_not_matter():
         np.testing.assert_allclose(function(*given), expected, atol=1e-9)
 
 
+def test_the_rate_of_the_samples_of_a_ramp_is_exact():
+    time = np.arange(0.0, 300.0, 0.05)
+    np.testing.assert_allclose(rate_of(START + time, 20.0 + 0.08 * time), 0.08, rtol=5e-4)
+
+
 @pytest.mark.parametrize('spacing', [10.0, 20.0, 30.0, 60.0])
 @pytest.mark.parametrize('lag', [30.0, 100.0, 300.0])
 def test_temperatures_ahead_of_a_lagging_sensor_and_of_a_lagging_die_are_found(spacing, lag):
@@ -84,8 +88,7 @@ def test_temperatures_ahead_of_a_lagging_sensor_and_of_a_lagging_die_are_found(s
 def test_temperature_ahead_of_a_lagging_sensor_is_found_in_a_stream(lag):
     wave, time = Wave(np.random.default_rng(4), lag), np.arange(0.0, 1200.0, 0.01)
     warm = stepped(wave.low_passed(time), 0.06)
-    stream = ThermalStream({KEY: Lag(lag, True)}, rate=True)
-    found = stream.add_all(START + time, warm)
+    found = ThermalStream({KEY: Lag(lag, True)}, rate=True).add_all(START + time, warm)
     settled = time > 100.0
     behind = rms((warm - wave.true(time))[settled])
     assert rms((found[KEY] - wave.true(time))[settled]) < 0.25 * behind
@@ -133,8 +136,7 @@ def test_fit_recovers_the_lag_within_its_uncertainty(effect, of_sensor, lag):
     rng = np.random.default_rng(int(lag + of_sensor))
     count = 80
     time = START + np.cumsum(rng.uniform(15.0, 30.0, count))
-    temperature = stepped(Wave(rng, 60.0).low_passed(time), 0.01)
-    context = {'time': time, 'temperature': temperature}
+    context = {'time': time, 'temperature': stepped(Wave(rng, 60.0).low_passed(time), 0.01)}
     values = np.array([1e-3, -1.5e-3, 1.2e-3, lag, of_sensor])
     true = Model({**{name: np.array(each) for name, each in SENSOR.items()}, effect: values})
     poses = simulate_poses(true, random_directions(count, rng), rng, context=context)
@@ -151,11 +153,6 @@ def test_fit_recovers_the_lag_within_its_uncertainty(effect, of_sensor, lag):
 def lagging(lag, of_sensor):
     """Return a model with a temperature that lags."""
     return Model({'offset_temperature': np.array([1e-3, 1e-3, 1e-3, lag, of_sensor])})
-
-
-def test_a_lag_needs_the_time():
-    with pytest.raises(InputError, match='need time'):
-        predict(lagging(60.0, 0.0), np.ones((1, 3)), {'temperature': np.array([20.0])})
 
 
 def test_points_do_not_depend_on_the_batches():

@@ -24,6 +24,7 @@ then determine only the rotation of the axes, ΔR.
 """
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -35,7 +36,9 @@ from .directions import (
     poses_needed)
 from .mounting import wiring
 from .planning import find_undetermined, refuse_if_unfit
-from .quality import finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, rival_findings
+from .quality import (
+    errors_after, finished, fit_findings, in_g, LARGEST_OFFSET_G, LARGEST_RESIDUAL_G, record_of,
+    rival_findings)
 from ..effects import EFFECTS, length_rows, linear_model, Model, MODELS, sensor_force, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
@@ -46,7 +49,7 @@ from ..finding import explained_by, Finding
 from ..geometry import unit
 from ..statistics import rms
 from ..stillness import check_axes
-from ..table import check_units, Poses
+from ..table import check_units, column_of, CONTEXT, Poses
 from ..text import listed, short
 from ..units import Floats, Indices, Method, METHODS, MG, MODEL_NAMES, Units
 
@@ -56,6 +59,9 @@ _NATIVE_SPREADS = 20.0
 the median, relative to the median of these distances."""
 
 _LEVEL_OF_MODELS = 0.03
+
+_LEAST_OF_CONTEXT = 12
+"""Smallest number of poses that show a cause of a residual: several more than its values."""
 
 _MOST_NAMED = 3
 """Largest number of groups of equal rows in a warning."""
@@ -119,7 +125,7 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
             'the sensor, and record again', 'USABLE', rows, step='record'),)
         sound = sound.take(~ended)
         rejected += tuple(Rejected(row, CLIPPED, 'clipped') for row in rows)
-    with explained_by(limited):
+    with explained_by(limited), explained_by(_of_context(sound, units)):
         calibration, doubts = _without_doubtful(sound, units, model, method)
         left_out = sorted((*rejected, *doubts, *calibration.rejected), key=lambda pose: pose.row)
         # The fitted table has references that the input may lack.
@@ -127,6 +133,27 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
         return finished(replace(
             calibration, poses=every, rejected=tuple(left_out),
             noted=(*wiring(calibration), *limited, *calibration.noted)), sensor, date)
+
+
+def _of_context(poses: Poses, units: Units) -> Iterator[Finding]:
+    """Yield the effect of a recorded column beside which alone poses are on a sphere."""
+    if len(poses) < _LEAST_OF_CONTEXT:
+        return
+    poses_g, left = in_g(poses, own_scale(poses, units)), dict[str, float]()
+    sphere = start_of('4', poses_g.reading)
+    for name, effect in EFFECTS.items():
+        if effect.needs and {*effect.needs} <= {*CONTEXT} & {*poses_g.columns}:
+            with suppress(NotConvergedError):
+                found = estimate(Model({
+                    **sphere.values, name: np.zeros(len(effect.parameters))}), poses_g)
+                left[name] = rms(errors_after(found.model, poses_g, vectors=False))
+    best = min(left, key=left.__getitem__, default='')
+    if best and left[best] < LARGEST_RESIDUAL_G < rms(
+            errors_after(sphere, poses_g, vectors=False)):
+        what = column_of(EFFECTS[best].needs[0]).meaning
+        yield Finding('note', f'with {best} the residual is {left[best] * MG:.2g} mg: the '
+                      f'readings change with the {what}', f'take poses at the same {what}, or '
+                      'refine with the base ideal', step='record')
 
 
 def _without_doubtful(poses: Poses, units: Units, model: str, method: Method
@@ -310,7 +337,8 @@ def _choose(fits: Mapping[str, Fit]) -> tuple[str, str]:
         added = small.dof - large.dof
         gained = max(small.chi2 - large.chi2, 0.0) / added
         chance = float(scipy.special.fdtrc(added, large.variance_dof, gained / large.variance))
-        before, after = (rms(fit.equations.of_poses(fit.residual)) * MG for fit in (small, large))
+        before, after = (rms(fit.equations.of_poses(fit.residual)) * MG if fit.dof else 0.0
+                         for fit in (small, large))
         added_words = EFFECTS[MODELS[name].effects[-1]].words
         change = f'the poses agree to {after:.3g} mg instead of {before:.3g} mg'
         if chance < _LEVEL_OF_MODELS:

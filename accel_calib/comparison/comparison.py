@@ -282,9 +282,6 @@ def _compare_each(given: Sequence[Comparable], prepared: Sequence[tuple[Context,
     return tuple(runs)
 
 
-_FIRST = datetime.min.replace(tzinfo=timezone.utc)
-
-
 @dataclass(frozen=True)
 class Moment:
     """
@@ -376,7 +373,7 @@ def history_of(calibrations: Sequence[Calibration]) -> History:
         moments.append(Moment(k, when, run.name, warm, run.quality.rms_after_mg))
     undated = [moment.index + 1 for moment in moments if moment.when is None]
     if not undated:
-        moments.sort(key=lambda moment: moment.when or _FIRST)
+        moments.sort(key=lambda moment: str(moment.when))  # all in UTC
     ordered = tuple(runs[moment.index] for moment in moments)
     whole, changes = compare_runs(ordered), []
     for pair in pairwise(ordered):

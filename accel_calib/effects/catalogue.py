@@ -148,11 +148,6 @@ def _since(context: Mapping[str, Any], shape: Floats) -> Any:
     return (context['time'] - shape[0]) / HOUR
 
 
-def _settling(context: Mapping[str, Any], shape: Floats) -> Any:
-    start, tau = shape
-    return np.exp(-np.maximum(context['time'] - start, 0.0) / max(tau, 1e-9))
-
-
 def _after(context: Mapping[str, Any], shape: Floats) -> Any:
     return np.asarray(context['time'] >= shape[0], float)
 
@@ -231,7 +226,8 @@ EFFECTS: dict[str, Effect] = {
         needs=('time',), shape=('start',), shapes=_from_start),
     'warm_up': _in_time(
         'offset that settles after power-on', 'turn-on transient', AXES, 'g', 0.005,
-        factor=_settling, needs=('time',), shape=('start', 'tau'), shapes=_taus),
+        needs=('time',), shape=('start', 'tau'), shapes=_taus, factor=lambda context, shape:
+        np.exp(-np.maximum(context['time'] - shape[0], 0.0) / max(shape[1], 1e-9))),
     'offset_step': _in_time(
         'offset that jumps at an instant', 'bias shift after shock', AXES, 'g', 0.005,
         factor=_after, needs=('time',), shape=('instant',), shapes=_instants),

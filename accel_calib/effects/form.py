@@ -155,8 +155,7 @@ class Term(NamedTuple):
 
 def by_axis(first: int) -> tuple[Term, ...]:
     """Return terms with one parameter and one monomial per axis."""
-    step = 0 if first == ONE else 1
-    return tuple(Term(axis, axis, first + step * axis) for axis in range(3))
+    return tuple(Term(axis, axis, first if first == ONE else first + axis) for axis in range(3))
 
 
 Factor = Callable[[Mapping[str, Any], Floats], Any]

@@ -251,9 +251,8 @@ class TemperatureHistory:
         """Return the mean columns that a model needs between two times; empty if not known."""
         _, columns = self._follow(model)
         inside = [each for time, each in columns if start - _APART <= time <= end]
-        if not inside:
-            return {}
-        return {key: np.array([np.mean([each[key] for each in inside])]) for key in inside[0]}
+        return {key: np.array([np.mean([each[key] for each in inside])])
+                for key in (inside[0] if inside else ())}
 
     def _follow(self, model: Model) -> tuple[ThermalStream | None, Iterable[tuple[float, Any]]]:
         """Return the stream of a model, which is followed from now on, and its columns."""

@@ -97,12 +97,6 @@ class Terms:
             'kin,ni->kn', self.gradients_at(u), direction)
         return monomials[self.place] * self.weight[:, np.newaxis]
 
-    def along(self, rows: Floats, u: Floats, direction: Floats | None = None) -> Floats:
-        """Return the (t, n) products of `plain` with an (n, 3) row per pose."""
-        found = self.plain(u, direction)
-        found *= rows.T[self.axis]
-        return found
-
     def gradients_at(self, u: Floats) -> Floats:
         """Return the (m, 3, n) derivatives of the monomials by the force."""
         x, y, z = u.T
@@ -524,7 +518,8 @@ def check_context(model: Model, context: Mapping[str, Any]) -> None:
     missing = [', '.join(column_of(key).names) for key in model.needs if key not in context]
     if missing:
         raise InputError(f'the effects of the model need {" and ".join(missing)}, which the input '
-                         'does not have', 'record these columns together with the readings')
+                         'does not have', 'record these columns together with the readings, or '
+                         'state them for each pose that is simulated')
 
 
 def linear_model(name: str, mat_w: Floats, vec_v: Floats) -> Model:

@@ -82,10 +82,6 @@ class EmpiricalCurve(EffectRecord):
         return (self.part,) if self.part else CARRIERS[self.carrier]
 
     @property
-    def unit(self) -> str:
-        return 'g' if self.carrier == 'offset' else 'g/g'
-
-    @property
     def entry(self) -> Effect:
         return _entry_of_curve(self)
 
@@ -189,13 +185,14 @@ def curves_over(quantities: Iterable[str] = ()) -> Iterator[EmpiricalCurve]:
 @lru_cache(maxsize=2048)
 def _entry_of_curve(curve: EmpiricalCurve) -> Effect:
     variable, modes = curve.variable, curve.modes
+    unit = 'g' if curve.carrier == 'offset' else 'g/g'
     if variable == 'direction':  # the gain of all axes as a sum of spherical harmonics
         zones = [number for number, zone in enumerate(ZONES) if zone.degree in modes]
         names = tuple(f'{degree}_{k}' for degree in modes for k in range(1, 2 * degree + 2))
         terms = tuple(Term(k, axis, ZONAL + 3 * number + axis)
                       for k, number in enumerate(zones) for axis in range(3))
         return Effect(f'gain as a smooth function of {VARIABLES["direction"]}',
-                      'empirical curve', names, curve.unit, 0.001, terms=terms, family='force')
+                      'empirical curve', names, unit, 0.001, terms=terms, family='force')
     parts, of_force = curve.parts, variable == 'force'
     carried = [term._replace(parameter=parts.index(own)) for term in _CARRIED[curve.carrier]
                if (own := CARRIERS[curve.carrier][term.parameter]) in parts]
@@ -207,7 +204,7 @@ def _entry_of_curve(curve: EmpiricalCurve) -> Effect:
     names = tuple(f'{own}_{mode}' for mode in modes for own in parts)
     words = (f'{curve.changed.replace("_", "-")} as a smooth function of '
              f'{variable_words(variable)}')
-    made = Effect(words, 'empirical curve', names, curve.unit, 0.001, terms=terms)
+    made = Effect(words, 'empirical curve', names, unit, 0.001, terms=terms)
     if of_force:
         return replace(made, family='force')
     return replace(made, factor=partial(_cosines, variable, modes, len(carried)),
@@ -282,7 +279,7 @@ def value_unit(effect: EffectKey, value_name: str) -> tuple[str, float]:
             return unit_of(effect.columns[entry.shape.index(value_name)]), 1.0
         return unit_of(effect.variable) if isinstance(effect, EmpiricalCurve) else (
             '' if entry.own else 's'), 1.0
-    unit = effect.unit if isinstance(effect, EmpiricalCurve) else entry.unit
+    unit = entry.unit
     if value_name.endswith('_square'):
         unit = f'{unit}²'
     return (f'm{unit}', MG) if unit in _IN_MILLI else (unit, 1.0)
@@ -341,7 +338,7 @@ def formula_of(effect: EffectKey, values: Floats, deviations: Mapping[str, float
     unit = 'g' if variable == 'force' else unit_of(variable)
     each = ', '.join(f'{own} = {expression(row)}'
                      for own, row in zip(names, fits[best].tolist(), strict=True))
-    return (f'{effect.carrier.replace("_", "-")} [m{effect.unit}]: {each}; t = '
+    return (f'{effect.carrier.replace("_", "-")} [m{effect.entry.unit}]: {each}; t = '
             f'{variable_words(variable)}{f" {_signed(-low)}" if low else ""}, from 0 to '
             f'{high - low:.6g} {unit}').rstrip()
 

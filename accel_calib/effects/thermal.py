@@ -56,7 +56,8 @@ _START_BEND = 5e-4
 """Standard deviation of the first and second derivative before the data [°C/s], [°C/s²]."""
 
 _BIN = 1.0
-"""Duration over which the samples of a stream are averaged for the rate [s]."""
+"""Duration over which samples are averaged for the rate [s]. Over shorter steps, the smoother
+loses the digits of a temperature that hardly changes."""
 
 _RESTART = 1.0
 """If the time of a stream jumps back by more than this, the stream starts again [s]."""
@@ -128,6 +129,9 @@ def _at_moments(time: Floats, temperature: Floats) -> tuple[Floats, NDArray[np.i
     """Return m increasing times, the place of each row among them, and the mean at each."""
     merged = np.round(time / _SHORTEST) * _SHORTEST  # almost equal times become equal
     moments, place = np.unique(merged, return_inverse=True)
+    if len(moments) > 1 and np.median(np.diff(moments)) < _BIN:  # samples, averaged as in a stream
+        place = np.unique(np.round(time / _BIN), return_inverse=True)[1]
+        moments = np.bincount(place, time) / np.bincount(place)
     return moments, place, np.bincount(place, temperature) / np.bincount(place)
 
 
@@ -207,23 +211,22 @@ def _spline(time: Floats, mean: Floats, variance: Floats
     """Return `rows`, `root` and `mean` of `_Steps` from readings at n increasing times."""
     apart = np.diff(time) / np.median(np.diff(time))
     size, first, last = len(mean) - 2, 1.0 / apart[:-1], 1.0 / apart[1:]
-    middle = -first - last
+    rows = first, -first - last, last
     of_error, of_process = np.zeros((2, 3, size))  # diagonals of the lower triangle
-    of_error[0] = first ** 2 * variance[:-2] + middle ** 2 * variance[1:-1] + (
-        last ** 2 * variance[2:])
-    of_error[1, :-1] = (middle[:-1] * first[1:] * variance[1:-2]
-                        + last[:-1] * middle[1:] * variance[2:-1])
-    of_error[2, :-2] = last[:-2] * first[2:] * variance[2:-2]
+    for k, row in enumerate(rows):
+        for beside in range(k + 1):
+            of_error[k - beside, :size - k + beside] += row[:size - k + beside] * rows[beside][
+                k - beside:] * variance[k:size + beside]
     of_process[0], of_process[1, :-1] = (apart[:-1] + apart[1:]) / 3.0, apart[1:-1] / 6.0
-    across = first * mean[:-2] + middle * mean[1:-1] + last * mean[2:]
+    across = sum(row * mean[k:size + k] for k, row in enumerate(rows))
     roots = [scipy.linalg.cholesky_banded(of_error + change * of_process, lower=True)
              for change in _CHANGES * np.max(variance)]
     root = max(roots, key=lambda root: -np.sum(np.log(root[0])) - across @
                scipy.linalg.cho_solve_banded((root, True), across) / 2.0)
     solved, moved = scipy.linalg.cho_solve_banded((root, True), across), np.zeros(len(mean))
-    for k, row in enumerate((first, middle, last)):
+    for k, row in enumerate(rows):
         moved[k:size + k] += row * solved
-    return (first, middle, last), root, mean - variance * moved
+    return rows, root, mean - variance * moved
 
 
 def _smoothed_rate(time: Floats, temperature: Floats) -> Floats:
@@ -278,11 +281,13 @@ def low_passed(time: Floats, temperature: Floats, lag: float, rate: Floats) -> F
     step, rise, rate = np.diff(time[order]), np.diff(temperature[order]), rate[order]
     usable = step > 0.0
     # Cubic Hermite: the rate is the mean rate plus a(1 - 2s) + b(1 - 6s + 6s²), s from 0 to 1,
-    # and ∫ rate exp(-(1 - s) x) ds over the step with moments M_k = ∫ s^k exp(-(1 - s) x) ds.
+    # and ∫ rate exp(-(1 - s) x) ds over the step with moments M_k = ∫ s^k exp(-(1 - s) x) ds,
+    # which are 1F1(1; k + 2; -x) / (k + 1) (Abramowitz and Stegun 1964, eq. 13.2.1).
     mean = np.divide(rise, step, out=np.zeros_like(rise), where=usable)
     first, last = np.nan_to_num(rate[:-1]), np.nan_to_num(rate[1:])
     odd, even = (first - last) / 2.0, (first + last) / 2.0 - mean
-    m_0, m_1, m_2 = _moments(step / lag)
+    m_0, m_1, m_2 = (scipy.special.hyp1f1(1.0, k + 2.0, -step / lag) / (k + 1.0)
+                     for k in range(3))
     bent = odd * (m_0 - 2.0 * m_1) + even * (m_0 - 6.0 * m_1 + 6.0 * m_2)
     # T - A: zero at the start, then its decay plus how far A falls behind over each step. After
     # pass k each sum has its last 2^k steps, and `kept` what remains of what is older.
@@ -294,23 +299,6 @@ def low_passed(time: Floats, temperature: Floats, lag: float, rate: Floats) -> F
         reach *= 2
     found[order] = temperature[order] - behind
     return found
-
-
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
-_SMALL = 3.0
-"""Steps up to this many lags are integrated by Gauss-Legendre; 8 points give all digits."""
-
-
-def _moments(steps: Floats) -> Floats:
-    """Return ∫ s^k exp(-(1 - s) x) ds from 0 to 1, (3, n) for k = 0, 1, 2 and each x of steps."""
-    s = (_NODES + 1.0) / 2.0
-    powers = s ** np.arange(3)[:, np.newaxis] * _WEIGHTS / 2.0
-    near = powers @ np.exp(-(1.0 - s)[:, np.newaxis] * np.minimum(steps, _SMALL))
-    x = np.maximum(steps, _SMALL)
-    m_0 = -np.expm1(-x) / x
-    m_1 = (1.0 - m_0) / x
-    m_2 = (1.0 - 2.0 * m_1) / x
-    return np.where(steps <= _SMALL, near, [m_0, m_1, m_2])
 
 
 class _RateFilter:

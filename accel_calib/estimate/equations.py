@@ -261,9 +261,7 @@ class Equations:
         """Return the (n,) residuals of poses [g]: signed for one equation each, else RMS."""
         sizes = residual * self.scale[self.pose]
         if len(sizes) == len(self.scale):
-            signed = np.zeros(len(self.scale))
-            signed[self.pose] = sizes
-            return signed
+            return np.bincount(self.pose, sizes)
         return np.sqrt(np.bincount(self.pose, sizes ** 2, len(self.scale)))
 
 
@@ -307,8 +305,9 @@ class _Alone:
         self._at, self._along = u, g
 
     def columns(self, model: Model | EachShape) -> Floats:
-        plain = model.terms.along(self._rows, self._at)
-        plain -= model.terms.along(self._rows_along, self._at, self._along)
+        terms, axis = model.terms, model.terms.axis
+        plain = terms.plain(self._at) * self._rows.T[axis]
+        plain -= terms.plain(self._at, self._along) * self._rows_along.T[axis]
         return model.basis_of(plain, self._context, self._at).summed
 
 
@@ -404,7 +403,5 @@ def variance_factor(chi2: float, dof: int, noise_known: bool) -> float:
     weight = np.exp(likelihood - largest) * (1.0 - STATED_NOISE)
     weight[_ONE] += STATED_NOISE * len(_SCALES) * np.exp(-largest)
     part = (weight / np.sum(weight)) @ within
-    above = int(np.argmax(part >= _INTERVAL))
-    share = (_INTERVAL - part[above - 1]) / (part[above] - part[above - 1])
-    between = width[above - 1] * (width[above] / width[above - 1]) ** share
+    between = np.exp(np.interp(_INTERVAL, part, np.log(width)))
     return float(between / NORMAL_95) ** 2

@@ -155,8 +155,6 @@ def by_pose(residual: Floats, columns: Floats, pose: Indices,
             prior: Floats | None = None) -> ByPose:
     """Return (m,) residuals and (m, q) columns by pose, given the (m,) pose of each equation."""
     rows, order = np.bincount(pose), np.argsort(pose, kind='stable')
-    if len(pose) == len(rows):
-        return ByPose(residual[order][:, np.newaxis], columns[order][:, np.newaxis], rows, prior)
     slot = np.arange(len(pose)) - np.repeat(np.cumsum(rows) - rows, rows)
     by_row = np.zeros((len(rows), int(rows.max())))
     derivative = np.zeros((*by_row.shape, columns.shape[1]))

@@ -84,9 +84,6 @@ _LEAST_RELATIVE = 1e-15
 
 _MANY = 200
 
-_MEDIAN_OF_CHI2 = {1: 0.454936, 3: 2.365974}
-"""Median of chi² by degrees of freedom."""
-
 _ROUNDS = 6
 """Largest number of fits after which poses are left out or included."""
 
@@ -248,7 +245,7 @@ def outliers_among(residual: Floats, basis: Floats, rows: Indices, dof: Sequence
     own, found = np.eye(residual.shape[2]) - basis @ basis.swapaxes(2, 3), []
     if len(rows) > _MANY:  # all at once, relative to the median
         belief = belief_in(noise_known)
-        usual = np.where(rows == 1, _MEDIAN_OF_CHI2[1], _MEDIAN_OF_CHI2[3]) / rows
+        usual = scipy.special.chdtri(rows, 0.5) / rows  # the median of chi²
         for k, limit in enumerate(limits):
             squared = _squared(residual[k], own[k]) / rows
             scale = float(np.median(squared / usual))

@@ -163,6 +163,8 @@ def verdict_words(result: Refinement) -> str:
 
 def short_verdict(result: Refinement) -> str:
     """Return the verdict as a part of a sentence, with the effects and their rivals."""
+    if result.undecided:
+        return 'too few poses to tell what explains the gap'
     names = [shown_name(step.name) + (f' (or {", ".join(rival_words(step))})' if step.rivals
                                       else '') for step in result.steps]
     found, verb = ' and '.join(names), 's' if len(names) == 1 else ''

@@ -82,9 +82,9 @@ _BRANCHES = 5
 _TESTED = 6
 """Number of extended sets whose shapes and outliers are found again."""
 
-_DECIMALS = 6
-"""Decimals of the scores that sets are sorted by: not the last bit of a processor decides, and
-equal scores keep their order."""
+DECIMALS = 6
+"""Decimals of scores and probabilities that are sorted: not the last bit of a processor decides,
+and equal ones keep their order."""
 
 
 class Block(NamedTuple):
@@ -497,7 +497,7 @@ def extend_each(front: list[Set]) -> list[Set]:
         for effect, numbers in linear.numbers_of.items():
             number = int(numbers[np.argmax(scores[numbers])])
             if scores[number] > -np.inf and not is_barred(linear.blocks[number], before.entries):
-                tops[effect] = round(float(scores[number]), _DECIMALS), number
+                tops[effect] = round(float(scores[number]), DECIMALS), number
         likely += [(score + before.unusual, before, number) for score, number in sorted(
             tops.values(), key=lambda each: -each[0])[:_BRANCHES]]
     likely.sort(key=lambda each: -each[0])
@@ -527,7 +527,7 @@ def choose_shapes(chosen: Set) -> Set:
 def best_of_each(sets: Iterable[Set]) -> list[Set]:
     """Return the best set of each list of effects and outliers, the best score first."""
     best: dict[tuple[frozenset[EffectKey], tuple[int, ...]], Set] = {}
-    for chosen in sorted(sets, key=lambda chosen: -round(chosen.score, _DECIMALS)):
+    for chosen in sorted(sets, key=lambda chosen: -round(chosen.score, DECIMALS)):
         best.setdefault((frozenset(chosen.effects), chosen.out), chosen)
     return list(best.values())
 

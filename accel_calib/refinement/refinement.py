@@ -27,7 +27,7 @@ from importlib import import_module
 import numpy as np
 
 from .search import beside_stored, Found, join, sampled, search, with_changes
-from .state import fitted_state, is_noise, slope_of_temperature, State
+from .state import fitted_state, is_noise, slope_of_temperature, State, without
 from .steps import (
     find_rivals, not_testable, Remark, remarks_on, Stage, Step, steps_of, untestable, Verdict,
     verdict_of)
@@ -482,14 +482,14 @@ def refitted(before: Calibration, poses: Poses, *, sensor: str = '', date: str =
     if lacking:
         raise RefusedFitError(f'the poses have no {" or ".join(lacking)}, which the calibration '
                               'in use corrects for', 'record it, or call ~/reset')
-    kept, outlying = poses_g, np.zeros(0, np.intp)
+    final = fitted_state(Model(before.model.values), poses_g)
     for _ in range(_ROUNDS):
-        kept = kept.take(np.setdiff1d(np.arange(len(kept)), outlying))
-        final = fitted_state(Model(before.model.values), kept)
-        outlying = np.zeros(0, np.intp) if final is None else outliers(final.fit, len(poses_g))
-        if not len(outlying):
+        if final is None or not len(outlying := outliers(final.fit, len(poses_g))):
             break
-    if final is None or len(outlying):
+        final = fitted_state(Model(before.model.values), without(final.poses_g, outlying))
+    else:
+        final = None
+    if final is None:
         raise RefusedFitError('the effects of the calibration cannot be fitted to these poses, '
                               'expected a fit that converges', TAKE_ALL_SIDES)
     out = [Rejected(int(row), 'outlier', 'outlier') for row in poses_g.row

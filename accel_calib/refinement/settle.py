@@ -34,7 +34,8 @@ import scipy
 
 from .curves import Process, process_of, SIGNIFICANT, Walk, walk_beside
 from .linear import (
-    best_of_each, choose_shapes, extend_each, is_barred, LEVEL, Linear, Set, with_outliers)
+    best_of_each, choose_shapes, DECIMALS, extend_each, is_barred, LEVEL, Linear, Set,
+    with_outliers)
 from .state import (
     Candidate, candidates, fitted_state, is_noise, left_open, linearised, State, with_effect,
     without)
@@ -254,7 +255,7 @@ def probabilities(name: EffectKey, near: Near, *, usual: bool = True) -> dict[Ef
     weights = {key: float(np.exp(certainty * (score - most) / 2.0))
                for key, score in scores.items()}
     total = sum(weights.values())
-    ordered = sorted(weights, key=lambda key: -weights[key])
+    ordered = sorted(weights, key=lambda key: -round(weights[key], DECIMALS))
     return {key: weights[key] / total for key in ordered}
 
 

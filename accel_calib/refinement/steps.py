@@ -131,9 +131,8 @@ class Step:
 
     def odds(self, rival: str) -> tuple[float, float]:
         """Return the probability of a rival, and that by the data alone."""
-        whole, alone = (each.get(rival, LEAST / 10.0) for each in (  # those left out are small
-            self.probabilities, self.data_probabilities))
-        return whole, alone
+        least = LEAST / 10.0  # those left out are small
+        return self.probabilities.get(rival, least), self.data_probabilities.get(rival, least)
 
     @property
     def times_typical(self) -> float:

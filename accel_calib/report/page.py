@@ -424,7 +424,7 @@ def draw_curve(result: Refinement, step: int) -> Iterator[Drawing]:
             panel.plot(poses, np.full(len(poses), 0.02), '|', color=INK, markersize=7,
                        transform=panel.get_xaxis_transform())
         panel.set_xlabel(both.label)
-        panel.set_ylabel(f'change from the mean [m{curve.unit}]')
+        panel.set_ylabel(f'change from the mean [m{curve.entry.unit}]')
         panel.legend(ncols=len(parts))
     yield Drawing(f'step{step + 1}_curve', title, figure)
 
