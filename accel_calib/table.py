@@ -30,8 +30,12 @@ ABOUT = ('units', 'sensor', 'autopilot')
 LARGEST = 1e30
 """Larger numbers are damage. The products of smaller ones do not overflow."""
 
-_LIMITS = {'temperature': (-100.0, 250.0, 'from -100 to 250 °C')}
-"""Ranges of values, and their words: no sensor works beyond, and -999 or -127 mean no value."""
+_LIMITS = {'temperature': (-100.0, 250.0, 'from -100 to 250 °C'),
+           'count': (0.0, LARGEST, 'above 0, the number of samples of each pose'),
+           'std': (-1e-300, LARGEST, 'of 0 or more, standard deviations'),
+           'rate_std': (-1e-300, LARGEST, 'of 0 or more, standard deviations')}
+"""Ranges of values, and their words: no sensor works at temperatures beyond, and -999 or -127 mean
+no value."""
 
 _NUMBERS = range(-2**31, 2**32)
 """Numbers of an autopilot: those of 32 bits, with or without a sign."""
@@ -409,18 +413,10 @@ def check_values(columns: Mapping[str, NDArray[Any]], source: str,
             raise InputError(f'{source}: row {row + 1 if rows is None else rows[row]} of '
                              f'{", ".join(COLUMNS[key].names)} holds {what}, expected finite '
                              f'numbers {words}', 'correct the row or remove it')
-    if 'count' in columns and not np.all(columns['count'] > 0):
-        raise InputError(f'{source}: column count holds numbers that are not above 0, expected '
-                         'positive numbers', 'enter the number of samples of each pose')
     if 'orientation' in columns and np.any(columns['orientation'] % 1.0):
         raise InputError(f'{source}: column orientation holds fractions, expected whole numbers: '
                          'rows with the same number have the same orientation', 'number the '
                          'orientations, or leave out the column: --columns orientation=')
-    for key in ('std', 'rate_std'):
-        if key in columns and not np.all(columns[key] >= 0):
-            one, two, three = COLUMNS[key].names
-            raise InputError(f'{source}: column {one}, {two} or {three} holds negative numbers, '
-                             'expected 0 or more', 'enter standard deviations')
 
 
 _LIKELY_G = (0.5, 2.0)

@@ -26,10 +26,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, ExitStack
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 import shutil
 import sqlite3
 import struct
+import sys
 from tempfile import TemporaryDirectory
 from typing import Any, TYPE_CHECKING
 
@@ -257,6 +259,12 @@ LARGEST = 1e6
 _BLOCK_BYTES = 1 << 24
 """Number of bytes above which a block ends."""
 
+ZSTD = 'compression.zstd' if sys.version_info >= (3, 14) else 'backports.zstd'
+"""The zstd of Python 3.14, or that which `rosbags` needs before."""
+
+_PACKED = b'\x28\xb5\x2f\xfd'
+"""First bytes of a message that zstd compressed, which no CDR begins with."""
+
 NUMBERS = ('float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32', 'int64',
            'uint64')
 NO_QUANTITIES = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time',
@@ -309,9 +317,11 @@ class Bag:
         """
         block: list[Received] = []
         left = _BLOCK_BYTES
-        for message in self.reader.messages(connections):
-            block.append(message)
-            left -= len(message[2])
+        for connection, received, raw in self.reader.messages(connections):
+            if raw[:4] == _PACKED and self.ros2:  # without metadata.yaml that tells it
+                raw = import_module(ZSTD).decompress(raw)
+            block.append((connection, received, raw))
+            left -= len(raw)
             if left < 0 or len(block) == size:
                 yield block
                 block, left = [], _BLOCK_BYTES

@@ -35,6 +35,7 @@ import math
 import os
 from pathlib import Path
 import pickle
+import re
 import resource
 import signal
 import socket
@@ -127,7 +128,8 @@ class LogFile:
         except Exception as err:  # libraries raise errors of any class
             if isinstance(err, OSError) and err.errno not in _BY_VALUE:
                 raise
-            raise self.damaged(reason(err)) from err
+            why = re.sub(r'\S*/accel_calib_\w+/[^\s:]*', self.path.name, reason(err))
+            raise self.damaged(why) from err
 
 
 @contextmanager

@@ -62,11 +62,14 @@ LABELLED_UNIT = re.compile(r'(?<=[\d.]) *(?:m?g|m/s(?:\^?2|²|/s)|(?:°|deg|rad)
                            r'(?=[\s,;|]|$)')
 """Unit after a number with a name."""
 
-CLOCK = re.compile(
+_CLOCK = re.compile(
     r'(?:(\d{4}[-/]\d{1,2}[-/]\d{1,2}|\d{1,2}-[A-Za-z]{3}-\d{4}|\d{1,2}[./]\d{1,2}[./]\d{4})'
-    r',?[T ])?(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,:](\d+))?)? ?([AaPp]\.?[Mm]\.?)? ?'
+    r',?[T ])?(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,:](\d*))?)? ?([AaPp]\.?[Mm]\.?)? ?'
     r'(Z|UTC|[-+]\d{2}(?::?\d{2})?)?', re.ASCII)
 """Date, which may be absent, and time of the day."""
+
+_DIGITS = re.compile(r'(20\d\d)(0[1-9]|1[0-2])([0-3]\d)[T_ ]?([0-2]\d)([0-5]\d)([0-5]\d)[.,]?')
+"""Date and time of the day in digits alone."""
 
 RATES_HZ = (1.0, 10_000.0)
 """Plausible numbers of samples per second."""
@@ -299,9 +302,9 @@ def is_filled(cell: str) -> bool:
     return cell.casefold() not in _EMPTY
 
 
-def is_clock(text: str) -> bool:
-    """Return whether a text is a date with a time, or a time of the day."""
-    return CLOCK.fullmatch(text) is not None
+def clock_in(text: str) -> re.Match[str] | None:
+    """Return date, which may be absent, time, and zone of a text; None if it is no time."""
+    return _CLOCK.fullmatch(_DIGITS.sub(r'\1-\2-\3T\4:\5:\6.', text, count=1))
 
 
 def short(text: str) -> str:
@@ -337,7 +340,7 @@ def choose_columns(layout: TextLayout, options: LogOptions) -> Chosen:
                if found.keys() >= {*own.names}}
     sources |= {key: (k,) for key, k in found.items() if key not in OURS}
     clocks = layout.first(found['time'])[:_FIRST_ROWS] if 'time' in found else []
-    dates = sources['time'] if clocks and all(map(is_clock, clocks)) else ()
+    dates = sources['time'] if clocks and all(map(clock_in, clocks)) else ()
     texts = {'label', 'time'} if dates else {'label'}
     needed = {k for key, which in sources.items() if key not in texts for k in which}
     of_poses = options.partial or bool(OF_POSES & sources.keys())
@@ -515,7 +518,7 @@ def _contexts(layout: TextLayout, found: Mapping[str, int]) -> dict[str, int]:
     # in whole seconds, is no clock of the samples.
     cells = {k: layout.first(k) for k in columns_named('time', header) if 'time' not in found}
     different = {k: len(set(texts)) for k, texts in cells.items()
-                 if all(is_number(text.replace(',', '.')) or is_clock(text)
+                 if all(is_number(text.replace(',', '.')) or clock_in(text)
                         for text in texts[:_FIRST_ROWS])}
     different |= {k: max(different.get(other, 0), different[k]) for k in different
                   for other in _fraction(layout, k).values()}
@@ -553,7 +556,7 @@ def _fraction(layout: TextLayout, best: int) -> dict[str, int]:
     """Return the column of the part of a second beside whole seconds, such as that of ROS."""
     header, cells = layout.header, layout.first(best)
     known = meaning(header[best])
-    clocks = [*map(CLOCK.fullmatch, cells)]
+    clocks = [*map(clock_in, cells)]
     if not (all(match and not match[5] for match in clocks) or (
             unit_of('time', known.unit) == ('s', 1.0) and _in_range(cells, 1.0, math.inf))):
         return {}

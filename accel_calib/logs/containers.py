@@ -31,13 +31,13 @@ from itertools import chain, islice
 import json
 from pathlib import Path
 import re
-import sys
 from typing import Any
 import zipfile
 
 import numpy as np
 import scipy
 
+from .bag import ZSTD
 from .child import LogFile
 from .columns import BY_ORDER, is_log_header, LogOptions, shown
 from ..errors import InputError
@@ -53,12 +53,9 @@ CELL_BYTES = 18
 _PIECE, _ENCRYPTED = 1 << 16, 1
 
 
-_ZSTD = 'compression.zstd' if sys.version_info >= (3, 14) else 'backports.zstd'
-"""The zstd of Python 3.14, or that which `rosbags` needs before."""
-
 PACKED: Mapping[str, tuple[bytes, str]] = {
     '.gz': (rb'\x1f\x8b\x08', 'gzip'), '.bz2': (rb'BZh\d1AY&SY', 'bz2'),
-    '.xz': (rb'\xfd7zXZ\0', 'lzma'), '.zst': (rb'\x28\xb5\x2f\xfd', _ZSTD)}
+    '.xz': (rb'\xfd7zXZ\0', 'lzma'), '.zst': (rb'\x28\xb5\x2f\xfd', ZSTD)}
 """First bytes of packed files by suffix, and the modules that open them."""
 
 UNPACK = 'unpack it, and use the log in it'
@@ -112,12 +109,19 @@ def _pieces(opened: Callable[[], Any]) -> Bytes:
 
 
 def text(path: Path, _: ExitStack) -> list[Member]:
-    """Return the only table of a file, unpacked if it is packed."""
-    with path.open('rb') as file:
-        head = file.read(10)
-    packed = next((module for first, module in PACKED.values() if re.match(first, head)), 'io')
-    opened = partial(import_module(packed).open, path, 'rb')
-    return [Member('', path.stat().st_size, partial(_pieces, opened))]
+    """Return the only table of a file."""
+    return [_unpacked(partial(path.open, 'rb'), path.stat().st_size)]
+
+
+def _unpacked(opened: Callable[[], Any], size: int) -> Member:
+    """Return the only table of a file that a function opens; unpacked if it is packed."""
+    def unpacked() -> Any:
+        file = opened()
+        packed = next((module for first, module in PACKED.values()
+                       if re.match(first, file.peek(10))), None)
+        return file if packed is None else import_module(packed).open(file)
+
+    return Member('', size, partial(_pieces, unpacked))
 
 
 def archived(path: Path, stack: ExitStack) -> list[Member]:
@@ -402,7 +406,7 @@ def _table(name: str, header: list[str], *arrays: Any) -> Member:
 # ---------------------------------------------------------------- standard input, DataFrame
 
 class Piped(str):
-    """The bytes of a text log that came through standard input; the text is its name."""
+    """The bytes of a log that came through standard input; the text is its name."""
 
     data: bytes
 
@@ -414,7 +418,7 @@ class Piped(str):
     @property
     def table(self) -> Member:
         """Return the log as a table."""
-        return Member('', len(self.data), lambda: (part for part in (self.data,)))
+        return _unpacked(lambda: io.BufferedReader(io.BytesIO(self.data)), len(self.data))
 
 
 @dataclass(frozen=True)

@@ -182,7 +182,8 @@ def _opened(file: LogFile, member: Member, options: LogOptions) -> Iterator[Text
         name = member.name or (path.stem if path.suffix in containers.PACKED else path.name)
         inside = recognised(Path(name), raw.peek())
         if inside is not TEXT:
-            raise InputError(f'{path} holds {name}, {inside.name}, expected a table of text',
+            what = inside.name if name == path.name else f'{name}, {inside.name}'
+            raise InputError(f'{path} holds {what}, expected a table of text',
                              containers.UNPACK)
         yield text_table(path / member.name, options, raw, member.size)
 
@@ -249,9 +250,11 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     samples: Iterator[Recording]
     with saying(', '.join(quantities.said)):
         head = next(blocks)
-        check_units(head, quantities.units, str(path))
-        if 'time' in head and are_samples(head.columns):
+        is_recording = 'time' in head and are_samples(head.columns)
+        if is_recording:
             check_order(head['time'], head.reading, str(path))
+        check_units(head, quantities.units, str(path))
+        if is_recording:
             samples = _without_empty_cells(chain((head,), blocks))
             count = len(head)
             if text.more:  # the size of the file, and the rows of this block, tell about how many
@@ -364,7 +367,8 @@ _EXPORT, _VEHICLE = 'export it as CSV with ', 'copy it from the vehicle again'
 _ZIP = rb'PK\x03\x04'
 
 FORMATS = (
-    Format('a bag', ('.mcap', '.db3', '.bag'), b'', opened=_bag, needs='rosbags',
+    Format('a bag', ('.mcap', '.db3', '.bag'), rb'\x89MCAP0|SQLite format 3\0|#ROSBAG V',
+           opened=_bag, needs='rosbags',
            module='rosbags.rosbag2',
            again='use another bag, or one file of it; mcap recover repairs an mcap file that is '
            'cut, and ros2 bag reindex a metadata.yaml'),
@@ -475,6 +479,10 @@ def open_log(path: Path | Piped | Frame, options: LogOptions = LogOptions()) -> 
                 head = file.read(_HEAD)
                 file.seek(max(file.tell(), path.stat().st_size - _TAIL))
                 known = recognised(path, head + file.read())
+            if known is BAG:
+                raise InputError(f'{path} holds a bag, expected the suffix of one: '
+                                 f'{", ".join(BAG.suffixes)}',
+                                 'rename it')
         if known.advice:
             raise InputError(f'{path} is {known.name}, expected a log or a table that is read',
                              known.advice.format(path.name))

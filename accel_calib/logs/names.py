@@ -47,7 +47,7 @@ _WORDS = {
     'rate': 'g gy gyr gyro gyroscope gyroadc omega w angvel angularvelocity angularrate '
             'rotationrate rotrate',
     'time': 'time timestamp timestamps t ts stamp clock date datetime epoch gpst elapsed millis '
-            'micros uptime zeit uhrzeit temps heure tiempo hora tempo',
+            'micros uptime tick ticks tow itow zeit uhrzeit temps heure tiempo hora tempo',
     'temperature': 'temperature temp tmp temperatur temperatura',
     'supply_voltage': 'vdd vcc supply'}
 WORDS: Mapping[str, tuple[str, ...]] = {key: tuple(text.split()) for key, text in _WORDS.items()}
@@ -109,6 +109,9 @@ _UNITS = {
         ('s', 1.0): 's sec secs second seconds',
         ('ms', 1e-3): 'ms msec msecs millis milli millisecond milliseconds unixms',
         ('µs', 1e-6): 'us usec usecs micros micro microsecond microseconds',
+        ('min', 60.0): 'min mins minute minutes',
+        ('h', 3600.0): 'h hr hrs hour hours',
+        ('d', 86400.0): 'day days',
         ('ns', 1e-9): 'ns nsec nsecs nanos nano nanosec nanosecs nanosecond nanoseconds'},
     'temperature': {
         ('°C', 1.0): 'c degc celsius',

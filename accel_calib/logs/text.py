@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .columns import (
-    Cells, choose_columns, Dialect, EPOCH_S, is_clock, is_filled, is_log_header, is_number, LABEL,
+    Cells, choose_columns, clock_in, Dialect, EPOCH_S, is_filled, is_log_header, is_number, LABEL,
     LABELLED_UNIT, LogOptions, MONITOR, RATES_HZ, short, TextLayout, UNREADABLE)
 from .quantities import decide_quantities
 from ..disk import write_atomically
@@ -56,7 +56,7 @@ _RATE = re.compile(
     r'\W{1,2}(k?)Hz\W{1,6}(\d+(?:\.\d+)?)\b)', re.ASCII | re.IGNORECASE)
 """Rate of the samples in the lines before a table: ``Sample rate: 50.0Hz``, ``fs (Hz): 100``."""
 
-_MOTIONCAL = re.compile(r'Raw:(?:-?\d+,){8}-?\d+\s*')
+_MOTIONCAL = re.compile(r'Raw:(?:-?\d+,){8}-?\d+\s*$')
 _MOTIONCAL_NAMES = ('accX', 'accY', 'accZ', *6 * ('',))
 """Names of the counts that the sketches for MotionCal print; those of gyro and magnetometer have
 no unit."""
@@ -64,6 +64,7 @@ no unit."""
 _LIKE_NUMBER = re.compile(r'[-+]?(?:(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?|nan|inf)',
                           re.ASCII | re.IGNORECASE)
 _DECIMAL = re.compile(r'[-+]?\d*([.,])\d+(?:[eE][-+]?\d+)?', re.ASCII)
+_THOUSANDS = re.compile(r'[-+]?[1-9]\d{0,2},\d{3}', re.ASCII)
 _EXAMPLE = 'such as time,ax,ay,az and one row for each pose or sample'
 
 ROWS = 65536
@@ -151,7 +152,11 @@ def find_layout(path: Path, head: Sequence[str], options: LogOptions, encoding: 
     if all(line.isspace() or line[0] == '#' for line in head):
         raise InputError(f'{path} is empty, expected a header line {_EXAMPLE}',
                          'check that this is the intended file')
-    base = _base_of(head)
+    shares = {pattern: sum(pattern.match(line) is not None for line in head) / sum(
+        not line.isspace() for line in head) for pattern in (MONITOR, _MOTIONCAL)}
+    is_gcdc = any(line.startswith(';Headers,') for line in head)
+    base = Dialect(',', shares[MONITOR] > 1 / 2, marks=(*Dialect.marks, *';' * is_gcdc),
+                   prefix='Raw:' if shares[_MOTIONCAL] > 1 / 3 else '')
     plain = [k for k, line in enumerate(head) if base.is_row(line)]
     found = _find_names(head, base, options) or _find_numbers(head, base, plain)
     if found is None:
@@ -163,9 +168,12 @@ def find_layout(path: Path, head: Sequence[str], options: LogOptions, encoding: 
     below = [k for k in cells if k >= first]
     start = next((k for k in below if any(map(_LIKE_NUMBER.fullmatch, cells[k]))),
                  below[0] if below else len(head))
-    rate_hz = None if header else _rate_above([cells[k] for k in below if k >= start][:2])
-    if rate_hz is not None:
-        start = below[2] if len(below) > 2 else start
+    rate_hz, above = None, [{*cells[k]} for k in below if k >= start][:2]
+    if not header and [*map(len, above)] == [1, 1] and len(cells[start]) >= len('xyz'):
+        # Empatica writes time and rate into each column above all.
+        begun, rate = (float(cell) if is_number(cell) else 0.0 for cell, in above)
+        if begun > EPOCH_S[0] and RATES_HZ[0] <= rate <= RATES_HZ[1]:
+            rate_hz, start = rate, below[2] if len(below) > 2 else start
     passed = [short(head[k]) for k in plain if k < start and k != at]
     skipped = f'skipped {counted(len(passed), "line")} before the table'
     notes = [f'{skipped}{":" if len(passed) == 1 else ", the first is"} {each!r}'
@@ -177,8 +185,14 @@ def find_layout(path: Path, head: Sequence[str], options: LogOptions, encoding: 
               for before, *kilo, after in _RATE.findall(line[:1000])}
     if rate_hz is None and len(stated) == 1 and min(stated) > 0.0:
         rate_hz = stated.pop()
-    decimal = {match[1] for row in rows[:_TRIED_LINES] for match in map(_DECIMAL.fullmatch, row)
-               if match}
+    fractions = [match for row in rows[:_TRIED_LINES] for match in map(_DECIMAL.fullmatch, row)
+                 if match]
+    decimal = {match[1] for match in fractions}
+    if (dialect.delimiter == ',' or '.' in decimal) and ',' in decimal and all(
+            _THOUSANDS.fullmatch(match[0]) for match in fractions if match[1] == ','):
+        example = next(match[0] for match in fractions if match[1] == ',')
+        raise InputError(f'{path} has commas between thousands, such as {example}, expected plain '
+                         'numbers', 'write them without these commas')
     return TextLayout(
         path=path, dialect=dialect, decimal=min(decimal, default=''), header=header,
         units_row=units_row, width=_width(header, rows), start=start, encoding=encoding,
@@ -186,27 +200,8 @@ def find_layout(path: Path, head: Sequence[str], options: LogOptions, encoding: 
         sample=tuple(map(tuple, rows[:_TRIED_LINES])), rate_hz=rate_hz)
 
 
-def _rate_above(rows: Sequence[Sequence[str]]) -> float | None:
-    """Return the rate in two rows: Empatica writes time and rate into each column above all."""
-    values = [{float(cell) for cell in row} for row in rows if all(map(is_number, row))]
-    if [*map(len, values)] != [1, 1] or len(rows[0]) < len('xyz'):
-        return None
-    (begun,), (rate,) = values
-    return rate if begun > EPOCH_S[0] and RATES_HZ[0] <= rate <= RATES_HZ[1] else None
-
-
 _Found = tuple[Dialect, tuple[str, ...], int, int]
 """Dialect, names, and the indices of the header line (or -1) and of the first line below it."""
-
-
-def _base_of(head: Sequence[str]) -> Dialect:
-    """Return what precedes each row, and which lines are none; the delimiter is any."""
-    filled = sum(not line.isspace() for line in head)
-    timed = sum(MONITOR.match(line) is not None for line in head)
-    raw = sum(_MOTIONCAL.fullmatch(line) is not None for line in head)
-    is_gcdc = any(line.startswith(';Headers,') for line in head)
-    return Dialect(',', timed > filled / 2, prefix='Raw:' if raw > filled / 3 else '',
-                   marks=(*Dialect.marks, ';') if is_gcdc else Dialect.marks)
 
 
 def _find_names(head: Sequence[str], base: Dialect, options: LogOptions) -> _Found | None:
@@ -231,7 +226,7 @@ def _names_in(line: str, dialect: Dialect) -> list[str]:
     """
     line = line.removeprefix(';Headers,')
     cells = dialect.cells(line.lstrip('#/% ') if line.startswith(Dialect.marks) else line)
-    if dialect.monitor and cells and is_clock(cells[0]):
+    if dialect.monitor and cells and clock_in(cells[0]):
         cells[0] = 'time'
     return [] if len(cells) < 3 or any(map(_LIKE_NUMBER.fullmatch, cells)) else cells
 
@@ -274,7 +269,7 @@ def _find_numbers(head: Sequence[str], base: Dialect, plain: Sequence[int]) -> _
 def _row_width(cells: Sequence[str]) -> tuple[int, int]:
     """Return the numbers of cells, and of those of text, of a row of numbers; 0 of others."""
     numbers = sum(_LIKE_NUMBER.fullmatch(cell) is not None for cell in cells)
-    others = sum(bool(cell) and not is_clock(cell) for cell in cells) - numbers
+    others = sum(bool(cell) and not clock_in(cell) for cell in cells) - numbers
     return (len(cells), others) if numbers >= 3 and others <= numbers else (0, 0)
 
 
@@ -367,7 +362,8 @@ class TextTable:
             line = rows[-1]
             is_whole = line.endswith('\n') and len(dialect.cells(line)) >= self.layout.width
             if self._fault(line) is not None and not is_whole:
-                words = f'is cut: {short(line)!r}' if short(line) else 'holds no text'
+                what = 'is no row' if line.endswith('\n') else 'is cut'
+                words = f'{what}: {short(line)!r}' if short(line) else 'holds no text'
                 self._cut = f'left out the last line, which {words}'
                 rows, number = rows[:-1], number[:-1]
         values = self._parsed(rows)
@@ -397,7 +393,7 @@ class TextTable:
             texts = ['\t'.join([row[k] for k in columns]) for row in rows]
             delimiter, columns, breaks = '\t', tuple(range(len(columns))), len(columns) - 1
         widths = {line.count(delimiter) if delimiter else len(line.split()) - 1 for line in texts}
-        if widths != {breaks} or any(not is_clock(dialect.cells(line)[k])
+        if widths != {breaks} or any(not clock_in(dialect.cells(line)[k])
                                      for k in self.columns.dates for line in lines):
             return None
         if delimiter != ',' and layout.decimal != '.':
@@ -435,15 +431,16 @@ class TextTable:
             return f' has {counted(len(cells), "value")}, expected {layout.width}'
         comma = layout.decimal != '.' and (layout.dialect.delimiter != ',' or '"' in line)
         present = [k for k in self.columns.context if is_filled(cells[k])]
-        for k in (*self.columns.needed, *present):
-            if not is_number(cells[k].replace(',', '.') if comma else cells[k]):
-                return (f', column {layout.name(k)} is {short(cells[k])!r}, expected a finite '
-                        'number')
-        for k in self.columns.dates:
-            if not is_clock(cells[k]):
-                return (f', column {layout.name(k)} is {short(cells[k])!r}, expected a time such '
-                        'as 2026-01-31T12:00:00.250')
-        return None
+        bad = [k for k in (*self.columns.needed, *present)
+               if not is_number(cells[k].replace(',', '.') if comma else cells[k])]
+        bad += [k for k in self.columns.dates if not clock_in(cells[k])]
+        if not bad:
+            return None
+        expected = ('a time such as 2026-01-31T12:00:00.250' if bad[0] in self.columns.dates else
+                    'a number, or a time such as 2026-01-31T12:00:00.250'
+                    if bad[0] in self.columns.sources.get('time', ()) else 'a finite number')
+        found = short(UNREADABLE.sub('?', cells[bad[0]]))
+        return f', column {layout.name(bad[0])} is {found!r}, expected {expected}'
 
 
 # ----------------------------------------------------------------------------- serial ports

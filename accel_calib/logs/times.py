@@ -11,7 +11,8 @@ are coarser than the samples, such as whole seconds, are spread: the k-th sample
 periods later, and those of the first stamp, which may lack some, end with it.
 
 Dates are those of ISO 8601, ``2026-01-31T12:00:00.250Z``, with a blank for the T or slashes, and
-``31-Jan-2026`` and ``31.01.2026``. A date without a zone is taken as UTC.
+``31-Jan-2026`` and
+``31.01.2026``; or digits alone, ``20260131120000250``. A date without a zone is taken as UTC.
 
 """
 
@@ -26,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .columns import (
-    Cells, Chosen, CLOCK, columns_named, counter_of, EPOCH_S, FRACTION, LogOptions, RATES_HZ,
+    Cells, Chosen, clock_in, columns_named, counter_of, EPOCH_S, FRACTION, LogOptions, RATES_HZ,
     TextLayout)
 from .names import bare_name, COUNTERS, READING, TICKS, unit_of, UNITS
 from ..errors import InputError
@@ -58,6 +59,15 @@ _USUAL_HZ, _POSES_HZ = 100.0, 1.0 / 30.0
 _FAR_S, _POSES_FAR_S = 1e3, 1e5
 """Usual rates of samples and of poses, and intervals of theirs that are not in s."""
 
+_LEAST_S = 2e-5
+"""Smallest interval of samples: a shorter one has another unit."""
+
+_FOUND = {name: factor for name, factor in _UNITS.items() if name not in ('min', 'h')}
+"""Units that are found by the rate; the others are too near to them."""
+
+_TURN_S = 60.0
+"""Longest turn from one pose to another one [s]."""
+
 _FASTEST = 1.0
 _ENDS = 8
 """Largest rate of the temperature of a board [°C/s], from the first to the last of these parts."""
@@ -65,26 +75,26 @@ _ENDS = 8
 _GAP = 3.0
 """Steps above this ratio to the median are interruptions."""
 
+_PACKETS = 0.01
+"""Share of interruptions above which samples come in packets, if most time is between them."""
+
 _REVERSED = 0.9
 """Share of steps back in time above which the newest row is the first one."""
 
 _COARSE_S, _COARSE_ROWS = 0.05, 3.0
 """Smallest step of stamps [s], and smallest number of samples with one stamp, that are spread."""
 
-_UNSORTED, _MANY_STEPS = 0.2, 50
-"""Share of steps back in time above which rows are in no order, of at least so many steps."""
+_UNSORTED, _STANDS, _MANY_STEPS = 0.2, 0.3, 50
+"""Share of steps back in time above which rows are in no order, and of rows with one time above
+which the clock stands still, of at least so many steps."""
 
 _SENSORS, _UNLIKE, _APART = (2, 3, 4), 5.0, 0.2
 """Numbers of sensors whose rows can alternate; the factor by which readings and steps in time
 then differ more than those of one; and the least difference of their readings if the times are
 even, relative to 1 g: less can be vibration at half the rate of the samples."""
 
-_MANY_ROWS = 500
 _WINDOW = 8
-_AT_REST = 0.3
-_MOVES = 5.0
-_MOVING = 0.05
-"""Share of windows whose scatter is above `_MOVES` times that at rest, the quantile `_AT_REST`."""
+"""Number of samples of a window; the readings in it change in a turn."""
 
 
 @dataclass
@@ -183,8 +193,9 @@ def check_order(time: Floats, reading: Floats, source: str) -> None:
     """Raise InputError if times of many samples are equal or in no order, or rows alternate."""
     steps = np.diff(time)
     back = int(np.count_nonzero(steps < 0.0))
-    if len(steps) >= _MANY_STEPS and not np.any(steps):
-        raise InputError(f'{source}: the times of {len(time)} rows are equal, expected times that '
+    ends = np.flatnonzero(np.concatenate([[True], steps != 0.0, [True]]))
+    if len(steps) >= _MANY_STEPS and (equal := int(np.max(np.diff(ends)))) > _STANDS * len(time):
+        raise InputError(f'{source}: the times of {equal} rows are equal, expected times that '
                          'advance', 'leave them out, and state the samples per second: '
                          '--columns time= --rate HZ')
     if len(steps) >= _MANY_STEPS and back > _UNSORTED * len(steps):
@@ -220,10 +231,8 @@ def _stated_clock(columns: Chosen, first: Cells, options: LogOptions, of_poses: 
         raise InputError(f'{layout.path} has times, but --rate is {options.rate:g}',
                          'remove --rate, or leave the times out with --columns time=')
     if columns.dates:
-        match = CLOCK.fullmatch(first.texts[column][0])
-        dated = match is not None and match[1] is not None
-        step = _step_of(Clock(columns).seconds(first))
-        rate = f' ({1.0 / step:.3g} Hz)' if step > 0.0 else ''
+        dated = (match := clock_in(first.texts[column][0])) and match[1]
+        _, rate = _rate_in(Clock(columns).seconds(first))
         return Clock(columns, periods=() if dated else (_DAY_S,), words=(
             f'{named}: {"dates" if dated else "times of the day"}{rate} -> s'))
     stamps = columns.numbers(first, 'time')[:, 0]
@@ -236,14 +245,20 @@ def _stated_clock(columns: Chosen, first: Cells, options: LogOptions, of_poses: 
                          'add a header line, or name the columns with --columns ax=1,ay=2,az=3')
     unit = _unit_of_time(columns, first, stamps, of_poses)
     scale = {**_UNITS, _TICK: 1e-4}[unit]
-    step = _step_of(Clock(columns, scale).seconds(first))
-    rate = f' ({1.0 / step:.3g} Hz)' if step > 0.0 else ''
+    step, rate = _rate_in(Clock(columns, scale).seconds(first))
     words = f'{named} in {unit}{rate}{"" if unit == "s" else " -> s"}'
     agrees = not layout.rate_hz or not step > 0.0 or any(
         1.0 / _AGREES < 1.0 / step / each < _AGREES for each in _rates_beside(layout, column))
-    doubts = () if agrees else (f'{name} has {1.0 / step:.4g} samples per second, but the '
-                                f'file states {layout.rate_hz:g} Hz',)
-    return Clock(columns, scale, _PERIODS_S.get(unit, ()), words, doubts)
+    doubts = [] if agrees else [f'{name} has {1.0 / step:.4g} samples per second, but the '
+                                f'file states {layout.rate_hz:g} Hz']
+    if not of_poses and 0.0 < step < _LEAST_S:
+        raise InputError(f'{layout.path} has {1.0 / step:.3g} samples per second, with {named} in '
+                         f'{unit}, expected at most {1.0 / _LEAST_S:.0f}',
+                         'state another unit in the name, such as time_s')
+    if not of_poses and step > 1.0 / RATES_HZ[0] and not unit_of('time', layout.unit(column)):
+        doubts.append(f'{named} is read in {unit}, one sample each {step:.4g} s; in another unit, '
+                      'its name has to state it, such as time_ms')
+    return Clock(columns, scale, _PERIODS_S.get(unit, ()), words, tuple(doubts))
 
 
 def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats, of_poses: bool) -> str:
@@ -255,28 +270,30 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats, of_poses: bool)
     if stated:
         return stated[0]
     step, is_counted = _step_of(stamps), 'count' in columns.sources
-    if layout.header and layout.name(column) == 'time' and step < (
-            _POSES_FAR_S if is_counted else _FAR_S):
-        is_marked = bool(layout.about) or is_counted
-        is_ours = is_marked or of_poses or columns.names('reading') == [*READING]
-        # A sensor that is logged each ten seconds is nearly always still. In a recording of turns
-        # and rests the scatter within many short windows is much larger than that at rest. Of real
-        # recordings by hand that is 10 % of the windows or more, of 58 h at rest 1 %.
-        if is_ours and not is_marked and len(stamps) >= _MANY_ROWS and step >= 1.0:
-            reading = columns.numbers(first, 'reading')
-            windows = reading[:len(reading) // _WINDOW * _WINDOW].reshape(-1, _WINDOW, 3)
-            scatter = np.linalg.norm(windows.std(axis=1), axis=1)
-            at_rest = float(np.quantile(scatter, _AT_REST))
-            is_ours = not np.mean(scatter > _MOVES * at_rest) > _MOVING
-        if is_ours:
-            return 's'
+    is_own = layout.header and layout.name(column) == 'time' and _LEAST_S < step < (
+        _POSES_FAR_S if is_counted else _FAR_S)
+    if is_own and (layout.about or is_counted or of_poses or (
+            columns.names('reading') == [*READING] and _can_turn(columns, first, 1.0 / step))):
+        return 's'
     return _likely_unit(columns, first, stamps, of_poses) if step > 0.0 else 's'
+
+
+def _can_turn(columns: Chosen, first: Cells, rate_hz: float) -> bool:
+    """Return whether a sensor that was turned was turned fast enough, if this is the rate."""
+    reading = columns.numbers(first, 'reading')
+    windows = reading[:len(reading) // _WINDOW * _WINDOW].reshape(-1, _WINDOW, 3)
+    if not len(windows):
+        return True
+    turned = np.linalg.norm(np.ptp(windows.mean(axis=1), axis=0))
+    fastest = np.max(np.linalg.norm(np.ptp(windows, axis=1), axis=1))
+    return bool(turned < np.median(np.linalg.norm(reading, axis=1))
+                or _WINDOW * (turned - fastest) <= _TURN_S * rate_hz * fastest)
 
 
 def _likely_unit(columns: Chosen, first: Cells, stamps: Floats, of_poses: bool) -> str:
     """Return the unit with a plausible rate, best one that the file states; else s."""
     (column,), layout = columns.sources['time'], columns.layout
-    step, units = _step_of(stamps), TICKS.get(bare_name(layout.name(column)), _UNITS)
+    step, units = _step_of(stamps), TICKS.get(bare_name(layout.name(column)), _FOUND)
     rates = {name: 1.0 / (step * unit) for name, unit in units.items()}
     plausible = [name for name, rate in rates.items() if RATES_HZ[0] * 0.9 <= rate
                  <= RATES_HZ[1] * 1.1]
@@ -290,12 +307,15 @@ def _likely_unit(columns: Chosen, first: Cells, stamps: Floats, of_poses: bool) 
     usual = _USUAL_HZ
     if of_poses:
         plausible, usual = [*rates], _POSES_HZ
-    elif 'temperature' in columns.sources:
-        warm = columns.numbers(first, 'temperature')[:, 0]
-        ends = np.array_split(warm[np.isfinite(warm)], _ENDS)
-        change = abs(float(np.median(ends[-1]) - np.median(ends[0]))) if len(ends[-1]) else 0.0
+    else:
         plausible = [name for name in plausible
-                     if change * rates[name] <= _FASTEST * len(stamps)] or plausible
+                     if _can_turn(columns, first, rates[name])] or plausible
+        if 'temperature' in columns.sources:
+            warm = columns.numbers(first, 'temperature')[:, 0]
+            ends = np.array_split(warm[np.isfinite(warm)], _ENDS)
+            change = abs(float(np.median(ends[-1]) - np.median(ends[0]))) if len(ends[-1]) else 0.0
+            plausible = [name for name in plausible
+                         if change * rates[name] <= _FASTEST * len(stamps)] or plausible
     return min(agreeing or since_1970 or plausible, default='s',
                key=lambda name: abs(math.log(rates[name] / usual)))
 
@@ -313,6 +333,12 @@ def _rates_beside(layout: TextLayout, time: int) -> list[float]:
     return rates
 
 
+def _rate_in(stamps: Floats) -> tuple[float, str]:
+    """Return the usual step between stamps [s], and the rate in words."""
+    step = _step_of(stamps)
+    return step, f' ({1.0 / step:.3g} Hz)' if step > 0.0 else ''
+
+
 def _step_of(stamps: Floats) -> float:
     """Return the usual step between stamps; some sensors repeat a stamp of whole ms."""
     steps = np.diff(stamps)
@@ -321,20 +347,22 @@ def _step_of(stamps: Floats) -> float:
     if np.count_nonzero(steps < 0.0) > _REVERSED * np.count_nonzero(steps):
         steps = -steps
     middle = float(np.median(steps))
-    if middle > 0.0:  # the mean, because stamps can be rounded, but without interruptions
-        usual = steps[(steps >= 0.0) & (steps <= _GAP * middle)]
-        return float(np.mean(usual)) if len(usual) else middle
-    ends = np.flatnonzero(steps)
+    usual = steps[(steps >= 0.0) & (steps <= _GAP * middle)]
+    ends = np.flatnonzero(np.abs(steps) > _GAP * middle)
+    are_packets = len(ends) > _PACKETS * len(steps) and usual.sum() < steps[ends].sum()
+    if middle > 0.0 and not are_packets:  # stamps can be rounded, so the mean, without gaps
+        return float(np.mean(usual))
     if len(ends) < 2:
         return float(np.maximum(steps, 0.0).sum()) / len(steps)
-    return float(np.median(np.abs(steps[ends]))) * (len(ends) - 1) / float(ends[-1] - ends[0])
+    between = float(np.median(np.abs(np.diff(stamps[ends + 1]))))  # stamps that advance
+    return between * (len(ends) - 1) / float(ends[-1] - ends[0])
 
 
 def _seconds_of(texts: NDArray[np.object_], path: Path, rows: NDArray[np.int64]) -> Floats:
     """Return the seconds of dates since 1970, or of times since midnight; else InputError."""
     seconds = np.zeros(len(texts))
     for k, text in enumerate(texts):
-        day, match = None, CLOCK.fullmatch(text)
+        day, match = None, clock_in(text)
         if match is not None:
             date, hours, minute, second, digits, half, zone = match.groups()
             day, hour = _day(date) if date else 0.0, int(hours)
