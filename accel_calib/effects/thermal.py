@@ -218,7 +218,7 @@ def _spline(time: Floats, mean: Floats, variance: Floats
             of_error[k - beside, :size - k + beside] += row[:size - k + beside] * rows[beside][
                 k - beside:] * variance[k:size + beside]
     of_process[0], of_process[1, :-1] = (apart[:-1] + apart[1:]) / 3.0, apart[1:-1] / 6.0
-    across = sum(row * mean[k:size + k] for k, row in enumerate(rows))
+    across = np.sum([row * mean[k:size + k] for k, row in enumerate(rows)], axis=0)
     roots = [scipy.linalg.cholesky_banded(of_error + change * of_process, lower=True)
              for change in _CHANGES * np.max(variance)]
     root = max(roots, key=lambda root: -np.sum(np.log(root[0])) - across @
