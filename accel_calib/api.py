@@ -466,7 +466,7 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
                                           turn=turn, temperatures=warm.tolist())
     else:
         if is_ramp and len(warm):
-            columns['temperature'] = np.linspace(*warm, len(up))
+            columns['temperature'] = np.linspace(warm[0], warm[1], len(up))
         found = simulate_poses(model, up, rng, noise_g=noise, samples=samples,
                                context={'reference': up, **columns})
     found = in_unit(found, known.from_g, native=known.is_native)

@@ -261,7 +261,7 @@ class Equations:
         """Return the (n,) residuals of poses [g]: signed for one equation each, else RMS."""
         sizes = residual * self.scale[self.pose]
         if len(sizes) == len(self.scale):
-            return np.bincount(self.pose, sizes)
+            return np.bincount(self.pose, sizes).astype(float)
         return np.sqrt(np.bincount(self.pose, sizes ** 2, len(self.scale)))
 
 

@@ -207,8 +207,7 @@ def linearised(fit: Fit, base: tuple[EffectKey, ...], tried: Iterable[Candidate]
     residual = near.residual
     if further.values:
         residual = residual + near.columns(further) @ amplitudes_of(further)
-    base_columns = np.hstack([near.columns(held)[:, held.fitted], near.columns(beside)])
-    onto = scipy.linalg.orth(base_columns / _norms(base_columns), rcond=1e-6)
+    onto = orthonormal(np.hstack([near.columns(held)[:, held.fitted], near.columns(beside)]))
     context = fit.context
     tried = [each.beside(further.values.get(each.effect), context) for each in tried]
     kinds_tried = [kind_of(each.effect) for each in tried]
@@ -236,6 +235,14 @@ def outside_of(onto: Floats, columns: Floats) -> tuple[Floats, Floats]:
     rows = columns.T / sizes[:, np.newaxis]
     rows -= (rows @ onto) @ onto.T
     return rows.T, np.where(sizes < np.inf, sizes, 1.0)
+
+
+def orthonormal(columns: Floats) -> Floats:
+    """Return orthonormal columns with the span of others."""
+    if not columns.shape[1]:
+        return columns
+    vectors, scales, _ = np.linalg.svd(columns / _norms(columns), full_matrices=False)
+    return np.asarray(vectors[:, scales > 1e-6 * scales[0]])
 
 
 def _norms(columns: Floats) -> Floats:
