@@ -61,7 +61,7 @@ def test_poses_are_captured_and_removed_on_request(bench: Any, readings: Reading
     assert answer.success, answer.message
     asked = answer.message.partition('; next: ')[2]
     assert re.search(r' up \([-+xyz ]+\)$', asked)
-    bench.spin(lambda: count(markers) == 1)
+    bench.send_until(lambda: bench.imu(poses[130]), lambda: count(markers) == 1)
     assert asked in [each.markers[-1].text for each in markers]
     bench.send_until(lambda: bench.imu(poses[130]), lambda: diagnostics and any(
         value.key == 'next' and value.value == asked
