@@ -65,15 +65,6 @@ def quaternion_of(rotation: Floats) -> tuple[float, float, float, float]:
     return x, y, z, w
 
 
-def rotation_from_quaternion(quaternion: Sequence[float]) -> Floats:
-    """Return the (3, 3) rotation matrix of a quaternion (x, y, z, w) of any length but 0."""
-    x, y, z, w = quaternion
-    return np.eye(3) + 2.0 / (x * x + y * y + z * z + w * w) * np.array(
-        [[-y * y - z * z, x * y - w * z, x * z + w * y],
-         [x * y + w * z, -x * x - z * z, y * z - w * x],
-         [x * z - w * y, y * z + w * x, -x * x - y * y]])
-
-
 def angle_of(rotation: Floats) -> float:
     """Return the angle of an orthogonal matrix [°], 0 to 180; that of a mirror is 90 or more."""
     cosine = (float(np.trace(rotation)) - 1.0) / 2.0
@@ -237,7 +228,11 @@ class StaticTransforms:
                 f'the static transform from {parent} to {child} has the quaternion ({words}) of '
                 f'length {math.sqrt(squared):.3g}, expected length 1',
                 'correct the node that publishes it')
-        rotation = rotation_from_quaternion(quaternion)
+        x, y, z, w = quaternion
+        rotation = np.eye(3) + 2.0 / squared * np.array(
+            [[-y * y - z * z, x * y - w * z, x * z + w * y],
+             [x * y + w * z, -x * x - z * z, y * z - w * x],
+             [x * z - w * y, y * z + w * x, -x * x - y * y]])
         before = self.parents.get(child)
         self.parents[child] = (parent, rotation)
         return before is None or before[0] != parent or not np.array_equal(before[1], rotation)

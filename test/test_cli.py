@@ -224,7 +224,7 @@ def test_the_report_has_a_page_and_figures(poses, tmp_path):
 
 @pytest.mark.parametrize(('module', 'line'), [
     ('matplotlib', 'refine poses.csv --report r.html'), ('aiohttp', 'live poses.csv'),
-    ('pyulog', f'capture {LOGS}/px4/default.ulg -o p.csv'),
+    ('allantools', 'noise poses.csv'), ('pyulog', f'capture {LOGS}/px4/default.ulg -o p.csv'),
     ('pymavlink', f'capture {LOGS}/ardupilot/two_imus.bin -o p.csv'),
     *((module, f'capture {next((LOG_CORPUS / "formats").glob(f"*{suffix}"))} -o p.csv')
       for module, suffix in (('h5py', '.h5'), ('pyarrow', '.feather')))])

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import json
 from pathlib import Path
 import re
-import sys
 from typing import Any
 
 from accel_calib.errors import InputError
@@ -276,9 +275,3 @@ def test_a_rest_is_rated(white: float, kind: str) -> None:
     found = {each.kind for each in rating.findings}
     assert kind in found
     assert ('noisy' in found) is (kind == 'noisy')
-
-
-def test_the_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, 'allantools', None)
-    with pytest.raises(InputError, match='run pip install allantools'):
-        noise_of(resting(20, 1000), G)

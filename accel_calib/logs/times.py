@@ -10,9 +10,9 @@ A counter of the clock can start again. Rows with the newest first are turned ro
 are coarser than the samples, such as whole seconds, are spread: the k-th sample of one stamp is k
 periods later, and those of the first stamp, which may lack some, end with it.
 
-Dates are those of ISO 8601, ``2026-01-31T12:00:00.250Z``, with a blank for the T or slashes, and
-``31-Jan-2026`` and
-``31.01.2026``; or digits alone, ``20260131120000250``. A date without a zone is taken as UTC.
+Dates are those of ISO 8601, ``2026-01-31T12:00:00.250Z``, with a blank for the T or slashes,
+``31-Jan-2026``, ``31.01.2026``, and digits alone, ``20260131120000250``. A date without a zone is
+taken as UTC.
 
 """
 

@@ -74,14 +74,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.util import find_spec
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 import scipy
 
-from ..errors import InputError
+from ..errors import needing
 from ..statistics import rms
 from ..units import Floats
 
@@ -164,9 +163,8 @@ def allan_variances(values: Floats, lengths: Counts) -> Floats:
 
 def check_allantools() -> None:
     """Raise InputError if allantools is not installed."""
-    if find_spec('allantools') is None:
-        raise InputError('allantools is not installed, but the Allan deviation needs it',
-                         'run pip install allantools')
+    with needing('allantools', 'the Allan deviation'):
+        import allantools  # noqa: F401
 
 
 @dataclass(frozen=True)

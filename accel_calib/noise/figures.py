@@ -31,8 +31,8 @@ import numpy as np
 import scipy
 
 from .allan import (
-    allan_variances, AxisNoise, check_allantools, COMPONENTS, FIGURES, fit_components, FLAT, Kind,
-    KINDS, LEVEL, NoiseFigures, octaves, shares, Spread, spread_of)
+    allan_variances, AxisNoise, COMPONENTS, FIGURES, fit_components, FLAT, Kind, KINDS, LEVEL,
+    NoiseFigures, octaves, shares, Spread, spread_of)
 from ..errors import InputError
 from ..stillness import CaptureSettings, StillDetector
 from ..table import concatenated, Floats, numbered, Recording
@@ -402,10 +402,9 @@ def noise_of(recording: Recording, units: Units, gravity: float = STANDARD_GRAVI
     Raises
     ------
     InputError
-        If there is no rest of at least 64 samples, or allantools is not installed.
+        If there is no rest of at least 64 samples.
 
     """
-    check_allantools()
     progress(0, 6 if 'rate' in recording else 3)
     rest = longest_rest(recording, units)
     lengths = octaves(rest.samples)

@@ -349,14 +349,11 @@ def settle(state: State, poses_g: Poses, fixed: tuple[EffectKey, ...],
 
 def _best_fit(near: Near, state: State, trial: Trial) -> tuple[Near, State | None]:
     """Return the fit of a set, or of a reshaped one whose fit has a better score."""
-    def score_of(fit: tuple[Near, State]) -> float:
-        chosen = fit[0].chosen
-        return float(near.plain.score(fit[1].rss, chosen.parameters, chosen.charge))
-
     tried = [near, *(replace(near, chosen=other) for other in reshaped(near.chosen))]
     fits = [(each, after) for each in tried
             if (after := trial.fitted(each.chosen, state)) is not None]
-    return max(fits, key=score_of, default=(near, None))
+    return max(fits, default=(near, None), key=lambda fit: float(near.plain.score(
+        fit[1].rss, fit[0].chosen.parameters, fit[0].chosen.charge)))
 
 
 def _best_near(linear: Linear, trial: Trial, refused: set[frozenset[EffectKey]]) -> Near:

@@ -24,7 +24,6 @@ from functools import cache
 from hashlib import sha256
 from html import escape
 from importlib.resources import files
-from importlib.util import find_spec
 import io
 from pathlib import Path
 import shlex
@@ -33,7 +32,7 @@ from xml.etree import ElementTree
 
 from .. import __version__
 from ..disk import write_atomically
-from ..errors import InputError
+from ..errors import needing
 from ..findings import Rating
 from ..statistics import NORMAL_95
 from ..table import Floats
@@ -184,9 +183,8 @@ class Drawing:
 
 def check_matplotlib() -> None:
     """Raise InputError if matplotlib is not installed."""
-    if find_spec('matplotlib') is None:
-        raise InputError('matplotlib is not installed, but figures need it',
-                         'run pip install matplotlib')
+    with needing('matplotlib', 'a figure'):
+        import matplotlib  # noqa: F401
 
 
 def styled() -> Any:

@@ -301,7 +301,6 @@ def _effects(stated: Mapping[str, Any], file: str, own: Sequence[OwnEffect]
                 f'{file} needs the effect {shown(name)} of the user ({shown(values.get("what"))}),'
                 ' expected its definition', 'use --also FILE.py with the file that defines it, '
                 'the parameter also of the node, or also=[effect] in Python')
-    for name in stated:
         try:
             key = effect_named(name[:LONGEST_NAME + 1], own)
         except KeyError:
