@@ -667,7 +667,8 @@ def test_a_cluster_that_lost_all_workers_for_good_starts_another(monkeypatch: An
 def test_of_recordings_that_share_a_task_only_the_deadly_one_fails(client: Any) -> None:
     items = [*map(str, range(30)), 'deadly', *map(str, range(30, 40))]
     scheduler = client.cluster.scheduler
-    before, scheduler.allowed_failures = scheduler.allowed_failures, 0
+    # One death is forgiven: a task can be sent to a worker that has just died.
+    before, scheduler.allowed_failures = scheduler.allowed_failures, 1
     try:
         found = dict(mapped(client, deadly, items))
     finally:
