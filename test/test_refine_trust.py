@@ -366,7 +366,7 @@ def test_effects_of_twelve_poses_are_named_and_not_used(seed):
     found = refine(poses, G, base='7')
     assert (len(names(found)), found.verdict) == (1, 'unexplained')
     assert (len(found.refusal), found.undecided, found.steps[0].parameters_sd) == (2, True, {})
-    assert short_verdict(found) == 'too few poses to tell what explains the gap'
+    assert short_verdict(found) == 'the refined calibration is refused'
 
 
 def test_samples_of_a_board_that_hardly_turns_give_it_no_absurd_gain():

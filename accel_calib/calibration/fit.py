@@ -24,7 +24,6 @@ then determine only the rotation of the axes, ΔR.
 """
 
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -36,9 +35,7 @@ from .directions import (
     poses_needed)
 from .mounting import wiring
 from .planning import find_undetermined, refuse_if_unfit
-from .quality import (
-    errors_after, finished, fit_findings, in_g, LARGEST_OFFSET_G, LARGEST_RESIDUAL_G, record_of,
-    rival_findings)
+from .quality import finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, rival_findings
 from ..effects import EFFECTS, length_rows, linear_model, Model, MODELS, sensor_force, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
@@ -49,7 +46,7 @@ from ..finding import explained_by, Finding
 from ..geometry import unit
 from ..statistics import rms
 from ..stillness import check_axes
-from ..table import check_units, column_of, CONTEXT, Poses
+from ..table import check_units, Poses
 from ..text import listed, short
 from ..units import Floats, Indices, Method, METHODS, MG, MODEL_NAMES, Units
 
@@ -59,9 +56,6 @@ _NATIVE_SPREADS = 20.0
 the median, relative to the median of these distances."""
 
 _LEVEL_OF_MODELS = 0.03
-
-_LEAST_OF_CONTEXT = 12
-"""Smallest number of poses that show a cause of a residual: several more than its values."""
 
 _MOST_NAMED = 3
 """Largest number of groups of equal rows in a warning."""
@@ -125,7 +119,7 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
             'the sensor, and record again', 'USABLE', rows, step='record'),)
         sound = sound.take(~ended)
         rejected += tuple(Rejected(row, CLIPPED, 'clipped') for row in rows)
-    with explained_by(limited), explained_by(_of_context(sound, units)):
+    with explained_by(limited):
         calibration, doubts = _without_doubtful(sound, units, model, method)
         left_out = sorted((*rejected, *doubts, *calibration.rejected), key=lambda pose: pose.row)
         # The fitted table has references that the input may lack.
@@ -133,27 +127,6 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
         return finished(replace(
             calibration, poses=every, rejected=tuple(left_out),
             noted=(*wiring(calibration), *limited, *calibration.noted)), sensor, date)
-
-
-def _of_context(poses: Poses, units: Units) -> Iterator[Finding]:
-    """Yield the effect of a recorded column beside which alone poses are on a sphere."""
-    if len(poses) < _LEAST_OF_CONTEXT:
-        return
-    poses_g, left = in_g(poses, own_scale(poses, units)), dict[str, float]()
-    sphere = start_of('4', poses_g.reading)
-    for name, effect in EFFECTS.items():
-        if effect.needs and {*effect.needs} <= {*CONTEXT} & {*poses_g.columns}:
-            with suppress(NotConvergedError):
-                found = estimate(Model({
-                    **sphere.values, name: np.zeros(len(effect.parameters))}), poses_g)
-                left[name] = rms(errors_after(found.model, poses_g, vectors=False))
-    best = min(left, key=left.__getitem__, default='')
-    if best and left[best] < LARGEST_RESIDUAL_G < rms(
-            errors_after(sphere, poses_g, vectors=False)):
-        what = column_of(EFFECTS[best].needs[0]).meaning
-        yield Finding('note', f'with {best} the residual is {left[best] * MG:.2g} mg: the '
-                      f'readings change with the {what}', f'take poses at the same {what}, or '
-                      'refine with the base ideal', step='record')
 
 
 def _without_doubtful(poses: Poses, units: Units, model: str, method: Method
@@ -369,15 +342,7 @@ def rejected_by(model: Model, poses_g: Poses, out: Indices | None = None
 
 def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
     """Fit poses of known orientation; parameters and errors as in `fit_poses`."""
-    reason = 'the orientations are known'
-    if 'reference' not in poses:
-        up, reason = faces(poses.reading), 'the poses are the six faces'
-        if up is None:
-            raise RefusedFitError(
-                'the poses have no ref_x,ref_y,ref_z and are not the six faces, but model 12 '
-                'needs known orientations', 'add these columns, use only the six faces (--rows), '
-                'or use model 10')
-        poses = poses.with_columns(reference=up * units.force_per_g)
+    poses, reason = _with_reference(poses, units)
     if method == 'ml':
         by_norm = _unless_placed_well(poses, units)
         if by_norm is not None:
@@ -414,6 +379,18 @@ def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
         fit, poses, units, unit(fit.poses_g['reference']), name=ORIENTED, method=method,
         covariance=covariance_with(fit, unlike), rejected=rejected, reason=reason,
         noted=tuple(noted))
+
+
+def _with_reference(poses: Poses, units: Units) -> tuple[Poses, str]:
+    """Return poses with their known forces, and why these are known."""
+    if 'reference' in poses:
+        return poses, 'the orientations are known'
+    up = faces(poses.reading)
+    if up is None:
+        raise RefusedFitError('the poses have no ref_x,ref_y,ref_z and are not the six faces, but '
+                              'model 12 needs known orientations', 'add these columns, use only '
+                              'the six faces (--rows), or use model 10')
+    return poses.with_columns(reference=up * units.force_per_g), 'the poses are the six faces'
 
 
 def _unless_placed_well(poses: Poses, units: Units) -> Calibration | None:

@@ -406,7 +406,8 @@ def _check_plausible(calibration: Calibration) -> None:
     if calibration.model.effects and not residual <= LARGEST_RESIDUAL_G:
         raise RefusedFitError(
             f'the residual is {residual * MG:.3g} mg (RMS) after the fit, expected less than '
-            f'{LARGEST_RESIDUAL_G * MG:.0f} mg: the poses are not on an ellipsoid', _CHECK_POSES)
+            f'{LARGEST_RESIDUAL_G * MG:.0f} mg: the poses are not on an ellipsoid',
+            'check the poses for mistakes, take new poses at one temperature, and fit again')
 
 
 def has_usual_gains(model: Model) -> bool:

@@ -139,10 +139,11 @@ _LEAST_P = 1e-16
 def verdict_words(result: Refinement) -> str:
     """Return the verdict as a sentence."""
     words = _VERDICTS[result.verdict]
-    if result.undecided:
-        if result.refusal:
-            why = result.refusal[0]
-        elif result.one_curve:
+    if result.undecided and result.refusal:
+        words = ('The gap is not explained, because the refined calibration is refused: '
+                 f'{result.refusal[0]}.')
+    elif result.undecided:
+        if result.one_curve:
             one, other = result.one_curve
             why = (f'{one} and {other} are in the same proportion on each axis, as parts of one '
                    'curve are' if other in {step.effect for step in result.steps} else
@@ -164,7 +165,8 @@ def verdict_words(result: Refinement) -> str:
 def short_verdict(result: Refinement) -> str:
     """Return the verdict as a part of a sentence, with the effects and their rivals."""
     if result.undecided:
-        return 'too few poses to tell what explains the gap'
+        return ('the refined calibration is refused' if result.refusal else
+                'too few poses to tell what explains the gap')
     names = [shown_name(step.name) + (f' (or {", ".join(rival_words(step))})' if step.rivals
                                       else '') for step in result.steps]
     found, verb = ' and '.join(names), 's' if len(names) == 1 else ''
