@@ -14,7 +14,7 @@ from rich.table import Table
 from .commands import next_command
 from .frame import (
     Done, FAILED, intake, log_options, NARROW, progress, read_lines, rows_between, short_if_known,
-    stored_calibration, table)
+    stored_calibration, table, Verdict)
 from ..calibration import verify
 from ..comparison import compare, history_of
 from ..errors import InputError
@@ -68,7 +68,9 @@ def several_verify(results: Sequence[dict[str, Any]], *, named: bool = True) -> 
           short(result['max_after_percent'] * 10), short_if_known(result['noise_floor_mg']))
          for result in results))
     for name, result in zip(names, results, strict=True):
-        yield from (f'{name}{line}' for line in result['rating_lines'])
+        first, *others = result['rating_lines']
+        yield Verdict(f'{name}{first}', result['rating'], len(name))
+        yield from (f'{name}{line}' for line in others)
         if result.get('above_max'):
             yield (f'{name}residual {short(result["rms_after_mg"])} mg is above --max '
                    f'{result["max_mg"]:g} mg: exit status {FAILED}')

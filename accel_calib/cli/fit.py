@@ -22,7 +22,7 @@ from rich.table import Table
 
 from .frame import (
     check_target, console, Done, fleet_prior, given, intake, log_options, Output, progress,
-    read_lines, rows_between, short_if_known, stored_calibration, table, Target)
+    read_lines, rows_between, short_if_known, stored_calibration, table, Target, Verdict)
 from ..calibration import Calibration, NORM_MODELS
 from ..disk import STANDARD_OUTPUT, write_atomically
 from ..effects import AXES, entry_of, parse_effect
@@ -167,11 +167,12 @@ def _page(args: argparse.Namespace, log: Path, found: Intake, outcome: Outcome) 
                             stored=str(args.output or 'calibration.yaml'))
 
 
-def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str]:
+def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[Verdict]:
     """Yield a line for each of several results."""
     for result in results:
-        yield (f'{result["file"]}: model {result["model"]}: {result["rms_before_mg"]:.3g} -> '
-               f'{result["rms_after_mg"]:.3g} mg, {result["rating"]}')
+        line = (f'{result["file"]}: model {result["model"]}: {result["rms_before_mg"]:.3g} -> '
+                f'{result["rms_after_mg"]:.3g} mg, ')
+        yield Verdict(f'{line}{result["rating"]}', result['rating'], len(line))
 
 
 def _tables(calibration: Calibration) -> Iterator[Any]:

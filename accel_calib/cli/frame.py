@@ -201,7 +201,8 @@ def _run_one(args: argparse.Namespace) -> int:
     rating, verbose, lines = done.rating, getattr(args, 'verbose', True), list[Any]()
     if rating is not None:
         command = done.result['next']['command']
-        lines = [*rating.lines, *([f'      {command}'] if command else [])]
+        first, *others = rating.lines
+        lines = [Verdict(first, rating.name), *others, *([f'      {command}'] if command else [])]
     findings = () if rating is None else rating.findings[rating.name != 'GOOD':]
     notes = [*(f'note: {each.words if verbose else each.text}' for each in findings), *done.notes]
     if not verbose and len(notes) > _MOST_NOTES:
@@ -330,12 +331,10 @@ def log_options(args: argparse.Namespace, calibration: Calibration | None = None
 
 def fleet_prior(args: argparse.Namespace) -> FleetPrior | None:
     """Return the typical values of ``--prior``, if they are given."""
-    if args.prior is not None:
-        return read_prior(args.prior, args.sensor_model)
-    if args.sensor_model:
+    if args.sensor_model and not args.prior:
         raise InputError('--sensor-model is given without --prior, expected both',
                          'add --prior, or leave out --sensor-model')
-    return None
+    return args.prior and read_prior(args.prior, args.sensor_model)
 
 
 @contextmanager
@@ -388,8 +387,16 @@ _TIED = r'(?<=±) | (?=±)|(?<==) | (?==)|(?<=\d) (?=(mg|g|s|h|Hz|%|°|°C|m/s²
 """Spaces at which a line does not break: ``value ± sd``, ``p = 0.1``, ``3 mg``."""
 
 
+class Verdict(NamedTuple):
+    """A line of text with a rating from a character on, which a terminal shows in colour."""
+
+    line: str
+    rating: str
+    start: int = 0
+
+
 class Output(Console):
-    """A console that breaks lines at words, and colours ratings; text has no markup."""
+    """A console that breaks lines at words, and takes text as it is, without markup."""
 
     def __init__(self, stderr: bool = False) -> None:
         super().__init__(stderr=stderr, highlight=False, markup=False, emoji=False)
@@ -400,18 +407,23 @@ class Output(Console):
 
     def print(self, *objects: Any, **options: Any) -> None:  # noqa: A003
         """Print; lines of text break at words, and the rest of a line is indented."""
-        if len(objects) != 1 or not isinstance(objects[0], str):
+        if len(objects) != 1 or not isinstance(given := objects[0], str | Verdict):
             super().print(*objects, **options)
             return
+        line, rating, start = given if isinstance(given, Verdict) else (given, '', 0)
+        text = self._break_lines(line)
+        if rating:
+            end = len(self._break_lines(line[:start + len(rating)]))
+            text.stylize(_COLOURS[rating], end - len(rating), end)
+        super().print(text, soft_wrap=True, **options)
+
+    def _break_lines(self, text: str) -> Text:
         lines = []
-        for line in objects[0].split('\n'):
+        for line in text.split('\n'):
             parts = wrap(re.sub(_TIED, _NO_BREAK, line), self.width, subsequent_indent='  ',
                          break_long_words=False, break_on_hyphens=False)
             lines.append('\n'.join(parts).replace(_NO_BREAK, ' ') or line)
-        text = self.render_str('\n'.join(lines))
-        for rating, style in _COLOURS.items():
-            text.highlight_regex(rf'\b{rating}\b', style)
-        super().print(text, soft_wrap=True, **options)
+        return self.render_str('\n'.join(lines))
 
 
 def shown(text: str, encoding: str) -> str:
