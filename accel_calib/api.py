@@ -451,14 +451,7 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
     # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
     rotation = rotation_from_rpy(*np.radians(np.asarray(mounting, float))).T
     model = model_with(effects, rotation, own_effects(also))
-    if directions is None:  # spread evenly, the first up, in mixed order
-        mixed = np.random.default_rng(poses).permutation(spread_directions(poses)[1:])
-        directions = np.vstack([[[0.0, 0.0, 1.0]], mixed])
-    up = np.asarray(directions, float)
-    if up.ndim != 2 or up.shape[1] != 3 or not np.all(np.linalg.norm(up, axis=1) > 0.0):
-        raise InputError(f'directions has shape {up.shape}, expected (n, 3) vectors',
-                         'give a vector other than zero for each pose')
-    up = unit(up)
+    up = _unit_directions(directions, poses)
     rng, warm = np.random.default_rng(seed), np.asarray(temperature, float)
     is_ramp = warm.shape in ((0,), (2,))
     columns = {key: np.asarray(values, float) for key, values in (
@@ -482,6 +475,18 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
                          f'below {LARGEST:g}', 'use smaller effects, noise and temperatures')
     kept = found if reference else found.without_columns('reference')
     return replace(kept, units=units)  # type: ignore[return-value]
+
+
+def _unit_directions(given: ArrayLike | None, count: int) -> Floats:
+    """Return the given directions, or as many spread evenly, the first up, in mixed order."""
+    if given is None:
+        mixed = np.random.default_rng(count).permutation(spread_directions(count)[1:])
+        return np.vstack([[[0.0, 0.0, 1.0]], mixed])
+    up = np.asarray(given, float)
+    if up.ndim != 2 or up.shape[1] != 3 or not np.all(np.linalg.norm(up, axis=1) > 0.0):
+        raise InputError(f'directions has shape {up.shape}, expected (n, 3) vectors',
+                         'give a vector other than zero for each pose')
+    return unit(up)
 
 
 def _asked(given: Source | Poses | Recording | Data, units: UnitName | None,

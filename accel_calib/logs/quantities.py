@@ -187,15 +187,7 @@ def decide_quantities(columns: Chosen, first: Cells, options: LogOptions) -> Qua
         made.notes += [columns.maker.note] if columns.maker.note else []
     made.said += columns.layout.words
     if 'instance' in columns.sources:
-        there = np.unique(columns.numbers(first, 'instance')).tolist()
-        names = [f'{each:g}' for each in there]
-        if options.sensor and options.instance not in names:
-            raise InputError(f'{columns.layout.path} has the sensors {", ".join(names)}, expected '
-                             f'{options.sensor}', 'choose one of them with --sensor')
-        made.instance = float(options.instance) if options.sensor else there[0]
-        if len(there) > 1 and not options.sensor:
-            made.notes.append(f'the log has the sensors {", ".join(names)}; sensor {names[0]} is '
-                              'read: choose another with --sensor')
+        _choose_instance(made, columns.numbers(first, 'instance')[:, 0], options)
         first = made.of_instance(first)
     for key in ('reading', 'rate'):
         if key in columns.sources and (modulus := modulus_of(columns.numbers(first, key))):
@@ -225,6 +217,19 @@ def decide_quantities(columns: Chosen, first: Cells, options: LogOptions) -> Qua
     _decide_context(made, first)
     made.findings += made.clock.findings
     return made
+
+
+def _choose_instance(made: Quantities, numbers: Floats, options: LogOptions) -> None:
+    """Choose one of the sensors whose rows alternate, by their numbers; by default the lowest."""
+    there = np.unique(numbers).tolist()
+    names = [f'{each:g}' for each in there]
+    if options.sensor and options.instance not in names:
+        raise InputError(f'{made.chosen.layout.path} has the sensors {", ".join(names)}, expected '
+                         f'{options.sensor}', 'choose one of them with --sensor')
+    made.instance = float(options.instance) if options.sensor else there[0]
+    if len(there) > 1 and not options.sensor:
+        made.notes.append(f'the log has the sensors {", ".join(names)}; sensor {names[0]} is '
+                          'read: choose another with --sensor')
 
 
 def _find_gyro(made: Quantities, first: Cells) -> None:

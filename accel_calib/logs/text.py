@@ -56,7 +56,7 @@ _RATE = re.compile(
     r'\W{1,2}(k?)Hz\W{1,6}(\d+(?:\.\d+)?)\b)', re.ASCII | re.IGNORECASE)
 """Rate of the samples in the lines before a table: ``Sample rate: 50.0Hz``, ``fs (Hz): 100``."""
 
-_MOTIONCAL = re.compile(r'Raw:(?:-?\d+,){8}-?\d+\s*$')
+_MOTIONCAL = re.compile(r'Raw:(?:-?\d+,){8}-?\d+\s*')
 _MOTIONCAL_NAMES = ('accX', 'accY', 'accZ', *6 * ('',))
 """Names of the counts that the sketches for MotionCal print; those of gyro and magnetometer have
 no unit."""
@@ -152,11 +152,7 @@ def find_layout(path: Path, head: Sequence[str], options: LogOptions, encoding: 
     if all(line.isspace() or line[0] == '#' for line in head):
         raise InputError(f'{path} is empty, expected a header line {_EXAMPLE}',
                          'check that this is the intended file')
-    shares = {pattern: sum(pattern.match(line) is not None for line in head) / sum(
-        not line.isspace() for line in head) for pattern in (MONITOR, _MOTIONCAL)}
-    is_gcdc = any(line.startswith(';Headers,') for line in head)
-    base = Dialect(',', shares[MONITOR] > 1 / 2, marks=(*Dialect.marks, *';' * is_gcdc),
-                   prefix='Raw:' if shares[_MOTIONCAL] > 1 / 3 else '')
+    base = _base_of(head)
     plain = [k for k, line in enumerate(head) if base.is_row(line)]
     found = _find_names(head, base, options) or _find_numbers(head, base, plain)
     if found is None:
@@ -168,12 +164,9 @@ def find_layout(path: Path, head: Sequence[str], options: LogOptions, encoding: 
     below = [k for k in cells if k >= first]
     start = next((k for k in below if any(map(_LIKE_NUMBER.fullmatch, cells[k]))),
                  below[0] if below else len(head))
-    rate_hz, above = None, [{*cells[k]} for k in below if k >= start][:2]
-    if not header and [*map(len, above)] == [1, 1] and len(cells[start]) >= len('xyz'):
-        # Empatica writes time and rate into each column above all.
-        begun, rate = (float(cell) if is_number(cell) else 0.0 for cell, in above)
-        if begun > EPOCH_S[0] and RATES_HZ[0] <= rate <= RATES_HZ[1]:
-            rate_hz, start = rate, below[2] if len(below) > 2 else start
+    rate_hz = None if header else _rate_above([cells[k] for k in below if k >= start][:2])
+    if rate_hz is not None:
+        start = below[2] if len(below) > 2 else start
     passed = [short(head[k]) for k in plain if k < start and k != at]
     skipped = f'skipped {counted(len(passed), "line")} before the table'
     notes = [f'{skipped}{":" if len(passed) == 1 else ", the first is"} {each!r}'
@@ -185,23 +178,47 @@ def find_layout(path: Path, head: Sequence[str], options: LogOptions, encoding: 
               for before, *kilo, after in _RATE.findall(line[:1000])}
     if rate_hz is None and len(stated) == 1 and min(stated) > 0.0:
         rate_hz = stated.pop()
-    fractions = [match for row in rows[:_TRIED_LINES] for match in map(_DECIMAL.fullmatch, row)
-                 if match]
-    decimal = {match[1] for match in fractions}
-    if (dialect.delimiter == ',' or '.' in decimal) and ',' in decimal and all(
-            _THOUSANDS.fullmatch(match[0]) for match in fractions if match[1] == ','):
-        example = next(match[0] for match in fractions if match[1] == ',')
-        raise InputError(f'{path} has commas between thousands, such as {example}, expected plain '
-                         'numbers', 'write them without these commas')
     return TextLayout(
-        path=path, dialect=dialect, decimal=min(decimal, default=''), header=header,
+        path=path, dialect=dialect, decimal=_decimal_of(path, dialect, rows), header=header,
         units_row=units_row, width=_width(header, rows), start=start, encoding=encoding,
         about=_about(path, head), notes=tuple(notes),
         sample=tuple(map(tuple, rows[:_TRIED_LINES])), rate_hz=rate_hz)
 
 
+def _decimal_of(path: Path, dialect: Dialect, rows: Sequence[Sequence[str]]) -> str:
+    """Return the decimal mark of numbers; raise InputError if commas part thousands."""
+    found = [match for row in rows[:_TRIED_LINES] for match in map(_DECIMAL.fullmatch, row)
+             if match]
+    marks = {match[1] for match in found}
+    commas = [match[0] for match in found if match[1] == ',']
+    if (dialect.delimiter == ',' or '.' in marks) and commas and all(
+            map(_THOUSANDS.fullmatch, commas)):
+        raise InputError(f'{path} has commas between thousands, such as {commas[0]}, expected '
+                         'plain numbers', 'write them without these commas')
+    return min(marks, default='')
+
+
+def _rate_above(rows: Sequence[Sequence[str]]) -> float | None:
+    """Return the rate in two rows: Empatica writes time and rate into each column above all."""
+    values = [{float(cell) for cell in row} for row in rows if all(map(is_number, row))]
+    if [*map(len, values)] != [1, 1] or len(rows[0]) < len('xyz'):
+        return None
+    (begun,), (rate,) = values
+    return rate if begun > EPOCH_S[0] and RATES_HZ[0] <= rate <= RATES_HZ[1] else None
+
+
 _Found = tuple[Dialect, tuple[str, ...], int, int]
 """Dialect, names, and the indices of the header line (or -1) and of the first line below it."""
+
+
+def _base_of(head: Sequence[str]) -> Dialect:
+    """Return what precedes each row, and which lines are none; the delimiter is any."""
+    filled = sum(not line.isspace() for line in head)
+    timed = sum(MONITOR.match(line) is not None for line in head)
+    raw = sum(_MOTIONCAL.fullmatch(line) is not None for line in head)
+    is_gcdc = any(line.startswith(';Headers,') for line in head)
+    return Dialect(',', timed > filled / 2, prefix='Raw:' if raw > filled / 3 else '',
+                   marks=(*Dialect.marks, ';') if is_gcdc else Dialect.marks)
 
 
 def _find_names(head: Sequence[str], base: Dialect, options: LogOptions) -> _Found | None:

@@ -363,12 +363,15 @@ class ManagedCalibrator(LifecycleNode):
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close the files and remove all topics and services."""
         self.close()
-        for kind in ('publisher', 'subscription', 'service', 'timer'):
-            for each in list(getattr(self, f'{kind}s')):
+        for kinds, destroy in ((self.publishers, self.destroy_publisher),
+                               (self.subscriptions, self.destroy_subscription),
+                               (self.services, self.destroy_service),
+                               (self.timers, self.destroy_timer)):
+            for each in list(kinds):
                 if each not in self._own:
                     # The executor calls these for the events that it has already received.
                     each.callback = each.send_response = lambda *given: None
-                    getattr(self, f'destroy_{kind}')(each)
+                    destroy(each)
         return TransitionCallbackReturn.SUCCESS
 
     on_shutdown = on_cleanup

@@ -158,8 +158,10 @@ class Store:
         """Return whether the present file can be used, or does not exist."""
         try:
             self.load_calibration()
-        except (AccelCalibError, OSError) as error:
-            if isinstance(error, OSError) and error.errno not in _UNREADABLE:
+        except AccelCalibError:
+            return False
+        except OSError as error:
+            if error.errno not in _UNREADABLE:
                 raise
             return False
         return True

@@ -192,11 +192,7 @@ def ramp_of(cells: Poses) -> Ramp:
     stretches = _averaged(cells.take(np.isfinite(cells['temperature']) & still))
     _check_jumps(stretches)
     warm, rate = stretches['temperature'], stretches['temperature_rate']
-    limit = _MOVING * float(np.quantile(np.abs(rate), 0.95))
-    rising, falling = warm[rate > limit], warm[rate < -limit]
-    both = len(rising) > 0 and len(falling) > 0 and bool(
-        min(rising.max(), falling.max()) - max(rising.min(), falling.min())
-        >= _OVERLAP * np.ptp(warm))
+    both = _reverses(warm, rate)
     slow = (np.abs(rate) * 60.0 <= FASTEST) | both
     if np.sum(slow) < LEAST_RESTS or np.ptp(warm[slow]) < LEAST_RANGE:
         raise InputError(
@@ -213,6 +209,15 @@ def ramp_of(cells: Poses) -> Ramp:
                      f'temperature changes by more than {FASTEST:g} °C/min')
     return Ramp(stretches.take(slow), both,
                 float(cells['time'][-1] - cells['time'][0]), tuple(notes))
+
+
+def _reverses(warm: Floats, rate: Floats) -> bool:
+    """Return whether a temperature rises and falls over a range that both share."""
+    limit = _MOVING * float(np.quantile(np.abs(rate), 0.95))
+    rising, falling = warm[rate > limit], warm[rate < -limit]
+    return len(rising) > 0 and len(falling) > 0 and bool(
+        min(rising.max(), falling.max()) - max(rising.min(), falling.min())
+        >= _OVERLAP * np.ptp(warm))
 
 
 def _moved(seconds: float, what: str) -> InputError:

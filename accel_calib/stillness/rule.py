@@ -188,12 +188,14 @@ class Levels:
         self._counts = np.zeros((6, _BINS), np.int64)
         self._lowest = np.full((6, _BINS, 3), np.inf)
         self._highest = np.full((6, _BINS, 3), -np.inf)
+        self._found: Floats | None = np.zeros(6)
 
     def add(self, variance: Floats, reading: Floats) -> None:
         """Count (axes, n) variances of stretches, NaN if unknown, with (3, n) mean readings."""
         axis, which = np.nonzero(np.isfinite(variance))
         if not len(axis):
             return
+        self._found = None
         with np.errstate(divide='ignore'):
             level = np.floor(np.log2(variance[axis, which])) + _ZERO
         found = axis, np.clip(level, 0, _BINS - 1).astype(np.intp)
@@ -204,25 +206,26 @@ class Levels:
     @property
     def least(self) -> Floats:
         """Return the (6,) variances at rest where something was far quieter; 0 elsewhere."""
-        found = np.zeros(6)
-        for axis, counts in enumerate(self._counts):
-            lowest, highest = self._lowest[axis], self._highest[axis]
-            near = np.convolve(counts, np.ones(2 * _NEAR + 1), 'same')
-            most = int(np.argmax(near))
-            rests = slice(max(most - _NEAR, 0), most + _NEAR + 1)
-            peak = rests.start + int(np.argmax(counts[rests]))
-            quieter = slice(1, max(peak - _BELOW, 1))
-            count = int(np.sum(counts[quieter]))
-            if not (count + counts[0] and max(count * _RARE, counts[0]) < near[most]):
-                continue
-            low, high = lowest[rests].min(axis=0), highest[rests].max(axis=0)
-            turned = np.max(high - low)
-            way = np.max(highest[quieter].max(axis=0, initial=-np.inf)
-                         - lowest[quieter].min(axis=0, initial=np.inf))
-            size = np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
-            if turned > _TURNED * size and way < _ONE_WAY * turned:
-                found[axis] = 2.0**(peak - _ZERO)
-        return found
+        if self._found is None:
+            self._found = np.zeros(6)
+            for axis, counts in enumerate(self._counts):
+                lowest, highest = self._lowest[axis], self._highest[axis]
+                near = np.convolve(counts, np.ones(2 * _NEAR + 1), 'same')
+                most = int(np.argmax(near))
+                rests = slice(max(most - _NEAR, 0), most + _NEAR + 1)
+                peak = rests.start + int(np.argmax(counts[rests]))
+                quieter = slice(1, max(peak - _BELOW, 1))
+                count = int(np.sum(counts[quieter]))
+                if not (count + counts[0] and max(count * _RARE, counts[0]) < near[most]):
+                    continue
+                low, high = lowest[rests].min(axis=0), highest[rests].max(axis=0)
+                turned = np.max(high - low)
+                way = np.max(highest[quieter].max(axis=0, initial=-np.inf)
+                             - lowest[quieter].min(axis=0, initial=np.inf))
+                size = np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
+                if turned > _TURNED * size and way < _ONE_WAY * turned:
+                    self._found[axis] = 2.0**(peak - _ZERO)
+        return self._found
 
 
 class Rule:
@@ -314,11 +317,7 @@ class Rule:
         scale = np.asarray(self._per_g)
         if not self.known:
             calm = measured & np.all(recent <= self.limit_of(noise), axis=0)
-            at_rest = np.where(calm, mean[:3], np.nan)
-            low = np.fmin.accumulate(np.column_stack([self._lowest, at_rest]), axis=1)[:, 1:]
-            high = np.fmax.accumulate(np.column_stack([self._highest, at_rest]), axis=1)[:, 1:]
-            self._lowest, self._highest = low[:, -1], high[:, -1]
-            scale = _half_range(low, high, noise[:3])
+            scale = self._widen(np.where(calm, mean[:3], np.nan), noise[:3])
         noise[:3] = np.fmax(noise[:3], (STD_FLOOR_G * scale)**2)
         limit = self.limit_of(noise)
         judged['sums']['level'][:, :axes], judged['limit'][:, :axes] = recent.T, limit.T
@@ -329,6 +328,13 @@ class Rule:
         fastest = self._settings.still_gyro_max or math.inf
         judged['still'] = still & ~(np.sum(mean[3:]**2, axis=0) > fastest**2)
         return judged
+
+    def _widen(self, at_rest: Floats, noise: Floats) -> Floats:
+        """Return half the range at each chunk, with (3, n) native readings at rest, or NaN."""
+        low = np.fmin.accumulate(np.column_stack([self._lowest, at_rest]), axis=1)[:, 1:]
+        high = np.fmax.accumulate(np.column_stack([self._highest, at_rest]), axis=1)[:, 1:]
+        self._lowest, self._highest = low[:, -1], high[:, -1]
+        return _half_range(low, high, noise)
 
     def is_steep(self, slope: Floats, scale: Floats, variance: Floats, drift_g: float = SLOPE_G
                  ) -> Bools:
