@@ -117,8 +117,8 @@ def poses_of(source: Source, options: LogOptions = LogOptions(),
 
     """
     with _opened(source, options) as log:
-        settings_from(settings, log.units)  # refuses an unknown one beside poses, too
         if log.poses is not None:
+            settings_from(settings, log.units)  # refuses an unknown one here, too
             return Intake(log.poses, log.units, log.read_as, log.noted())
         return _captured(source, log, options, settings, progress)[0]
 

@@ -13,6 +13,7 @@ letters and digits.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+import math
 import re
 from typing import Any, get_args, Literal, TypeVar
 
@@ -32,10 +33,10 @@ LARGEST = 1e30
 
 _LIMITS = {'temperature': (-100.0, 250.0, 'from -100 to 250 °C'),
            'count': (0.0, LARGEST, 'above 0, the number of samples of each pose'),
-           'std': (-1e-300, LARGEST, 'of 0 or more, standard deviations'),
-           'rate_std': (-1e-300, LARGEST, 'of 0 or more, standard deviations')}
-"""Ranges of values, and their words: no sensor works at temperatures beyond, and -999 or -127 mean
-no value."""
+           **dict.fromkeys(('std', 'rate_std'), (
+               -math.ulp(0.0), LARGEST, 'of 0 or more, standard deviations'))}
+"""Limits that values are between, and their words: no sensor works at temperatures beyond, and
+-999 or -127 mean no value."""
 
 _NUMBERS = range(-2**31, 2**32)
 """Numbers of an autopilot: those of 32 bits, with or without a sign."""

@@ -390,9 +390,9 @@ class Expected:
         self.few = scatter = 1.0  # the latter: largest scatter that few squares allow, over RMS
         if dof:
             scatter = math.sqrt(dof / float(scipy.special.chdtri(dof, 1.0 - _UNLUCKY)))
-            is_known, ratio = chi2 is not None, chi2 or 1.0
-            self.few = max(scatter * math.sqrt(
-                ratio / variance_factor(ratio * dof, dof, is_known)), 1.0)
+            ratio = 1.0 if chi2 is None else chi2
+            wider = ratio / variance_factor(ratio * dof, dof, chi2 is not None)
+            self.few = max(scatter * math.sqrt(wider), 1.0)
         self.hidden_mg = 0.0
         if dof and not self.is_partial:
             if floor is None or chi2 is None:

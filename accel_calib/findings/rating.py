@@ -10,7 +10,7 @@ Each rule yields what it finds, with what removes it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 import math
 from typing import Any, TYPE_CHECKING
@@ -251,12 +251,12 @@ def _advise(expected: Expected, otherwise: str) -> str:
                 otherwise)
 
 
-def step_after(calibration: Calibration, refinement: Refinement | None = None, *checked: Poses
-               ) -> NextStep:
+def step_after(calibration: Calibration, refinement: Refinement | None = None,
+               checked: Sequence[Poses] = ()) -> NextStep:
     """
     Return what to do with a good calibration; the rows are not those of its stored base.
 
-    It also holds at the temperatures of the poses that it was `checked` by.
+    Poses by which it was `checked` extend the range of temperatures in which it holds.
 
     """
     poses, words = calibration.used_poses, 'place the robot level, and level the mounting by it'
@@ -331,7 +331,7 @@ def rate_verification(verification: Verification, calibration: Calibration, pose
                f'largest {mg(verification.max_after_percent * MG / 100.0)}, {noise}, '
                f'{counted(len(poses), "pose")}, {100.0 * covered:.0f} % of the sphere')
     return rated(found, f'{what} ({degrees(error)} of tilt)', figures,
-                 step_after(calibration, None, poses))
+                 step_after(calibration, checked=[poses]))
 
 
 def rate_comparison(comparison: Comparison) -> Rating:
