@@ -12,8 +12,8 @@ from accel_calib.findings import rate
 from accel_calib.refinement import refine
 from accel_calib.report import calibration_page
 from inside import (
-    beginning, best_curve, export, format_calibration, Model, model_with, parse_calibration,
-    predict, simulate_poses)
+    beginning, best_curve, export, fitted_state, format_calibration, Model, model_with,
+    parse_calibration, predict, simulate_poses)
 import numpy as np
 import pytest
 from shared import G, random_directions, sensor, table
@@ -99,6 +99,30 @@ def test_a_nonlinearity_along_an_oblique_axis_is_described(oblique, form):
     assert errors[1] < 0.5 * errors[0]
     page = calibration_page(found.calibration, rate(found.calibration), '')
     assert re.search(r'<td>curve of force[^<]+</td><td>\d', page)
+
+
+def test_a_curve_is_recovered_within_its_uncertainty():
+    def form(temperature):
+        share = (temperature - low) / (high - low)
+        return 5e-3 * np.cos(2.0 * np.pi * share) - 4e-3 * np.cos(5.0 * np.pi * share)
+
+    warm = with_curve(np.zeros_like)[0]['temperature']
+    low, high = np.min(warm), np.max(warm)
+    poses, truth = with_curve(form)
+    state = base_of(poses)
+    found = best_curve(state, poses, ())
+    curve = found.name
+    assert curve.changed in ('offset', 'offset.x')
+    assert (curve.variable, {2, 5} <= set(curve.modes), found.out) == ('temperature', True, ())
+    fit = fitted_state(Model({**state.model.values, curve: found.values}), poses).fit
+    at = {'temperature': np.linspace(low, high, 21)}
+    nothing = np.zeros((21, 3))
+    error = predict(fit.model, nothing, at)[:, 0] - predict(truth, nothing, at)[:, 0] - form(
+        at['temperature'])
+    basis = fit.model.basis(nothing, at).full[:, 0]
+    deviation = np.sqrt(np.einsum('np,pq,nq->n', basis, fit.covariance, basis))
+    assert np.max(np.abs(error) / deviation) < 4.0
+    assert np.max(deviation) < 5e-4
 
 
 @pytest.mark.parametrize('scatter_g', [0.0, 2e-3])

@@ -11,7 +11,7 @@ from inside import (
     accepted, beginning, Block, candidates, explored, fitted_state, FoundCurve, grown_curve,
     is_better_than_walk, less, Linear, linearised, Model, Near, outside_of, probabilities, Process,
     process_of, RARE, REFINE_LEVEL, reshaped, rss_beside, search_effects, Set, SIGNIFICANT,
-    simulate_poses, Walk, walk_beside, WORTH)
+    simulate_poses, spread_directions, Walk, walk_beside, WORTH)
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -257,6 +257,34 @@ def test_whitened_equations_are_those_of_generalised_least_squares():
     flat = replace(walk, ratio=0.0).whitened(linear)
     np.testing.assert_array_equal(Set.of(flat).spanned[1], residual)
     assert white.penalty - flat.penalty == pytest.approx(np.linalg.slogdet(variance)[1])
+
+
+@pytest.mark.parametrize('chosen', [(), (0,)])
+@pytest.mark.parametrize('repeats', [1, 3])
+def test_a_held_out_residual_beside_a_walk_is_predicted_by_the_other_orientations(chosen, repeats):
+    rng, ratio = np.random.default_rng(6), 30.0
+    base, axes = np.split(np.linalg.qr(rng.normal(size=(15, 5)))[0], [1], axis=1)
+    process = Process(axes, 1.0 / np.arange(1, 5) ** 2)
+    variance = np.eye(15) + ratio * (axes * process.values) @ axes.T
+    both = rng.normal(size=(15, 2))
+    residual, column = np.split(both - base @ (base.T @ both), 2, axis=1)
+    linear = replace(by_hand(residual[:, 0], column, ['supply_ratio']), onto=base)
+    left, held_out = Walk(process, ratio, 0.0, 0.0).residuals(
+        Set.of(linear, chosen), np.tile(spread_directions(15 // repeats), (repeats, 1)))
+    design = np.column_stack([base, column[:, :len(chosen)]])
+
+    def beside(rows):
+        inverse = np.linalg.inv(variance[np.ix_(rows, rows)])
+        normal = design[rows].T @ inverse
+        return residual[:, 0] - design @ np.linalg.solve(
+            normal @ design[rows], normal @ residual[rows, 0])
+
+    for k in range(15):
+        others = np.flatnonzero((np.arange(15) - k) % (15 // repeats))
+        own, row = beside(others), variance[k, others]
+        expected = own[k] - row @ np.linalg.solve(variance[np.ix_(others, others)], own[others])
+        assert held_out[k] == pytest.approx(expected)
+    np.testing.assert_allclose(left, np.linalg.solve(variance, beside(np.arange(15))))
 
 
 @pytest.mark.parametrize('seed', [2, 8])
