@@ -55,7 +55,7 @@ def test_poses_are_captured_and_removed_on_request(bench: Any, readings: Reading
     bench.calibrator(auto_capture=False, sensor='arm', passthrough=True)
     poses = readings([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dwell=3.0)
     bench.feed(poses[:140])
-    bench.spin(lambda: still and still[-1].data)
+    bench.send_until(lambda: bench.imu(poses[130]), lambda: still and still[-1].data)
     assert count(markers) == 0
     answer = bench.call_while('capture_pose', lambda: bench.imu(poses[130]))
     assert answer.success, answer.message
